@@ -1,0 +1,140 @@
+"""The first crossing of an arc with the contacts of a system, found without ever passing one.
+
+With m a lower bound of a level's second derivative on a window, the level stays above f + f' s + m s^2 / 2 there, so
+that a step to the first zero of that parabola can never pass a crossing. On a plane and a parabolic arc m is exact and
+the first step ends at the crossing; elsewhere steps converge to it quadratically. The search is not differentiated: a
+Newton correction of its result is, which is the implicit function theorem.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool
+
+from ._polynomial import Polynomial, Window, derivative, evaluate, recentred
+from ._system import AbstractSystem, rounding
+from ._types import Index, Number, Scalar
+from ._vector import frozen, norm, select, slope
+
+
+class Arc(eqx.Module):
+    """Smooth motion from `time` on: polynomials of the configuration and of its rate (per second) in local time,
+    which runs from 0 to `length` in units of `unit` seconds."""
+
+    time: Scalar
+    configuration: tuple[Polynomial, ...]
+    rate: tuple[Polynomial, ...]
+    length: Number
+    unit: Number
+
+    def position(self, s: Number) -> tuple:
+        return tuple(evaluate(p, s) for p in self.configuration)
+
+    def tangent(self, s: Number) -> tuple:
+        """The derivative of `position`, per unit of local time."""
+        return tuple(evaluate(derivative(p), s) for p in self.configuration)
+
+    def velocity(self, s: Number) -> tuple:
+        return tuple(evaluate(p, s) for p in self.rate)
+
+
+class Search(NamedTuple):
+    """How far the search has come along an arc."""
+
+    s: Scalar  # local time up to which no contact is crossed
+    contact: Index  # the contact that is crossed at s, or -1
+    finished: Bool[Array, ""]  # a contact is crossed or the end of the arc is reached
+
+
+class _Step(NamedTuple):
+    size: Scalar  # to the first zero of the parabola below the level, or to the end of the window
+    hit: Bool[Array, ""]  # the level itself is zero there
+
+
+def _safe_step(system: AbstractSystem, contact: int, arc: Arc, s: Any, touching: Any) -> _Step:
+    q, tangent = arc.position(s), arc.tangent(s)
+    left = arc.length - s
+    value, rate = slope(lambda x: system.level(contact, arc.time, x), q, tangent)
+    tolerance = rounding(system, contact, q)
+    coefficients = tuple(recentred(p, s) for p in arc.configuration)
+    reach = system.reach(contact, q)
+    exact = reach is None and all(len(p) <= 3 for p in coefficients)
+    width = left
+    if reach is not None:
+        bends = [evaluate(derivative(derivative(p)), 0.0) for p in coefficients]
+        speed = norm(tangent) + jnp.sqrt(norm(bends) * reach)
+        width = jnp.where(speed * left > 2.0 * reach, 2.0 * reach / jnp.where(speed > 0, speed, 1.0), left)
+    m = jnp.asarray(system.bend(contact, arc.time, Window(coefficients, width)), dtype=value.dtype)
+
+    # A contact that has just been left has a gap of exactly zero that does not close; rounding may not say otherwise.
+    left_behind = touching & (s == 0)
+    value = jnp.where(left_behind, 0.0, jnp.maximum(value, 0.0))
+    rate = jnp.where(left_behind, jnp.maximum(rate, 0.0), rate)
+    disc = rate * rate - 2.0 * m * value
+    edge = jnp.sqrt(jnp.maximum(disc, 0.0))
+    falling = jnp.where(disc >= 0, 2.0 * value / _nonzero(edge - rate), jnp.inf)
+    rising = jnp.where(m < 0, (rate + edge) / _nonzero(-m), jnp.inf)
+    zero = jnp.where(rate < 0, falling, rising)
+    if exact:
+        return _Step(zero, zero <= left)
+    hit = (value <= tolerance) & ((rate < 0) | ((rate == 0) & (m < 0)))
+    last = jnp.where(rate < 0, jnp.minimum(value / _nonzero(-rate), left), 0.0)
+    return _Step(jnp.where(hit, last, jnp.minimum(zero, width)), hit)
+
+
+def _nonzero(x: Any) -> Any:
+    return jnp.where(x == 0, jnp.asarray(jnp.finfo(x.dtype).tiny, dtype=x.dtype), x)
+
+
+def search(system: AbstractSystem, arc: Arc, start: Any, touching: Index, n_steps: int) -> Search:
+    """At most `n_steps` safe steps along an arc, from local time `start` up to which no contact is crossed. `touching`
+    is the contact that was left at the beginning of the arc, or -1. Not differentiated."""
+    arc, system = frozen(arc), frozen(system)
+    none = jnp.asarray(-1, dtype=jnp.int32)
+
+    def step(state: Search) -> Search:
+        size, contact, hit = jnp.asarray(jnp.inf, dtype=state.s.dtype), none, jnp.asarray(False)
+        for i in range(system.n_contacts):
+            each = _safe_step(system, i, arc, state.s, touching == i)
+            closer = each.size < size  # a tie goes to the first
+            size = jnp.where(closer, each.size, size)
+            contact = jnp.where(closer, i, contact).astype(jnp.int32)
+            hit = jnp.where(closer, each.hit, hit)
+        hit = hit & (state.s + size <= arc.length)
+        s = jnp.minimum(state.s + size, arc.length)
+        found = Search(s, jnp.where(hit, contact, none), hit | (state.s + size >= arc.length))
+        return Search(*[jnp.where(state.finished, a, b) for a, b in zip(state, found, strict=True)])
+
+    state = Search(start, none, start >= arc.length)
+    if n_steps == 1 or system.n_contacts == 0:
+        return step(state)
+    going = lambda c: (c[0] < n_steps) & eqxi.unvmap_any(~c[1].finished)  # noqa: E731
+    return lax.while_loop(going, lambda c: (c[0] + 1, step(c[1])), (jnp.asarray(0), state))[1]
+
+
+def rests(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Bool[Array, ""]:
+    """Whether a bounce with the closing speed at `s` would not rise above rounding: the motion stays in contact."""
+    q, tangent = arc.position(s), arc.tangent(s)
+    here = Window(tuple(recentred(p, s) for p in arc.configuration), 0.0)
+    columns = []
+    for i in range(system.n_contacts):
+        _, rate = slope(lambda x, i=i: system.level(i, arc.time, x), q, tangent)
+        columns.append((rate, system.bend(i, arc.time, here), rounding(system, i, q)))
+    rate, bend, tolerance = (select(contact, column) for column in zip(*columns, strict=True))
+    return (bend < 0) & (rate * rate <= -2.0 * bend * tolerance)
+
+
+def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index, n_steps: int = 2) -> Scalar:
+    """The local time of a crossing found near `s`, differentiable in the arc and the system: Newton steps, of which
+    two also make second derivatives right. Where the level does not change (grazing) `s` is kept."""
+    s = frozen(s)
+    for _ in range(n_steps):
+        q, tangent = arc.position(s), arc.tangent(s)
+        pairs = [slope(lambda x, i=i: system.level(i, arc.time, x), q, tangent) for i in range(system.n_contacts)]
+        value, rate = (select(contact, column) for column in zip(*pairs, strict=True))
+        steep = jnp.abs(rate) > float(jnp.finfo(s.dtype).eps) * frozen(norm(tangent))
+        s = s - jnp.where(steep, value / jnp.where(steep, rate, 1.0), 0.0)
+    return s

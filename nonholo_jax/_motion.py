@@ -1,0 +1,108 @@
+"""How the system moves between contacts. A motion makes arcs; the event loop cuts them at contacts."""
+
+from abc import abstractmethod
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from ._crossing import Arc
+from ._system import AbstractSystem
+from ._types import Scalar
+from ._vector import times
+
+
+class Piece(NamedTuple):
+    """One arc, and what its motion wants to remember of it."""
+
+    arc: Arc
+    memory: Any  # of the solver, for the next piece; differentiable
+    trial: Any  # what `judge` needs
+
+
+class AbstractMotion(eqx.Module):
+    """Makes the arcs of a system. `safe_steps` is how many steps of the search for a crossing one turn of the loop
+    takes; `max_pieces(max_impacts)` bounds the number of arcs that a motion can be made of."""
+
+    safe_steps: eqx.AbstractVar[int]
+
+    @abstractmethod
+    def check(self, system: AbstractSystem) -> None:
+        """Raise `ValueError` if this motion cannot run the system."""
+
+    @abstractmethod
+    def max_pieces(self, max_impacts: int) -> int:
+        """The largest number of arcs."""
+
+    @abstractmethod
+    def max_turns(self, max_impacts: int) -> int:
+        """The largest number of turns of the loop."""
+
+    @abstractmethod
+    def begin(self, system: AbstractSystem, time: Scalar, state: Any, t1: Scalar) -> tuple[Any, Any]:
+        """The control of the step size, which is not differentiated, and the memory of the solver, which is."""
+
+    @abstractmethod
+    def size(self, control: Any, left: Scalar) -> Scalar:
+        """The size in seconds of the next arc."""
+
+    @abstractmethod
+    def piece(
+        self, system: AbstractSystem, time: Scalar, state: Any, memory: Any, jumped: Bool[Array, ""], size: Scalar
+    ) -> Piece:
+        """The arc of that size from a state; `jumped` says that the state has just changed by an impact."""
+
+    @abstractmethod
+    def judge(self, control: Any, size: Scalar, trial: Any) -> tuple[Bool[Array, ""], Any]:
+        """Whether the arc is accurate enough, and the control for the next one."""
+
+
+class Exact(AbstractMotion):
+    """Closed-form flight in uniform gravity: parabolas, without an integrator and without a tolerance.
+
+    Refuses (with `ValueError`) a scene with air, and an `Implicit` surface without a bound of its curvature.
+
+    ```python
+    from nonholo_jax import Exact
+    motion = Exact()
+    ```
+    """
+
+    safe_steps: int = eqx.field(static=True, default=1)
+
+    def check(self, system):
+        if system.uniform_acceleration() is None:
+            raise ValueError(
+                "Argument `motion` must be Integrated() where the acceleration is not uniform (air), but got Exact(); "
+                "try motion=None."
+            )
+        for i in range(system.n_contacts):
+            if not system.is_bounded(i):
+                raise ValueError(
+                    "Argument `motion` must be Integrated() for a surface whose curvature is not bounded, but got "
+                    "Exact(); try Implicit(gap, law, curvature=...)."
+                )
+
+    def max_pieces(self, max_impacts):
+        return max_impacts + 1
+
+    def max_turns(self, max_impacts):
+        return 256 * (max_impacts + 2)
+
+    def begin(self, system, time, state, t1):
+        return None, None
+
+    def size(self, control, left):
+        return left
+
+    def piece(self, system, time, state, memory, jumped, size):
+        q, v = system.evolving(state)
+        a = system.uniform_acceleration()
+        assert a is not None
+        configuration = tuple((x, u, times(0.5, w)) for x, u, w in zip(q, v, a, strict=True))
+        rate = tuple((u, w) for u, w in zip(v, a, strict=True))
+        return Piece(Arc(time, configuration, rate, size, 1.0), None, None)
+
+    def judge(self, control, size, trial):
+        return jnp.asarray(True), None

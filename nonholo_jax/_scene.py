@@ -1,0 +1,169 @@
+"""A scene: one ball, named surfaces, gravity and perhaps air."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ._air import Air
+from ._ball import Ball, BallState
+from ._polynomial import Window
+from ._rotation import turned
+from ._surface import AbstractSurface
+from ._system import AbstractSystem, rounding
+from ._types import Vector3
+from ._vector import (
+    add,
+    as_vector,
+    components,
+    cross,
+    dot,
+    plus,
+    ratio,
+    scale,
+    select,
+    select_vector,
+    subtract,
+    times,
+)
+
+
+class Flight(NamedTuple):
+    """A ball's state inside the engine: one scalar per component."""
+
+    position: Vector3
+    velocity: Vector3
+    spin: Vector3
+    orientation: Any
+
+
+class Scene(AbstractSystem):
+    """A ball and what it can hit.
+
+    **Arguments:**
+
+    - `ball`: a `Ball`.
+    - `surfaces`: a mapping from names to surfaces, in the order that `ImpactLog.surface` counts. May be empty.
+    - `gravity`: acceleration in m/s^2, shape (3,).
+    - `air`: an `Air`, or `None` for flight along parabolas.
+
+    Every number may be a JAX array: it is then traced, and can be differentiated and mapped over. Numbers of Python
+    become constants of the compiled program. Raises `ValueError` where a number that is known is not admissible.
+
+    ```python
+    from nonholo_jax import Ball, Plane, Rough, Scene
+    floor = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Rough(restitution=0.9))
+    scene = Scene(Ball(radius=0.025, mass=0.046), {"floor": floor})
+    ```
+    """
+
+    ball: Ball
+    surfaces: tuple[AbstractSurface, ...]
+    gravity: Any
+    air: Air | None
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        ball: Ball,
+        surfaces: Mapping[str, AbstractSurface],
+        gravity: Any = (0.0, 0.0, -9.81),
+        air: Air | None = None,
+    ):
+        self.ball = ball
+        self.surfaces = tuple(surfaces.values())
+        self.names = tuple(surfaces)
+        self.gravity = as_vector(gravity)
+        self.air = air
+        for name, surface in surfaces.items():
+            for holds, sentence in surface.is_proper(ball.radius):
+                if isinstance(holds, bool) and not holds:
+                    raise ValueError(f"Surface `{name}`: argument {sentence}.")
+
+    def surface(self, name: str) -> AbstractSurface:
+        """The surface of that name; raises `ValueError` with the known names if there is none."""
+        if name not in self.names:
+            raise ValueError(f"Argument `name` must be one of {', '.join(self.names)}, but got {name!r}.")
+        return self.surfaces[self.names.index(name)]
+
+    @property
+    def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return len(self.surfaces)
+
+    def evolving(self, state: Flight) -> tuple:
+        return state.position, state.velocity
+
+    def uniform_acceleration(self):
+        return components(self.gravity) if self.air is None else None
+
+    def acceleration(self, time, state, q, v):
+        g = components(self.gravity)
+        return g if self.air is None else add(g, self.air.acceleration(self.ball, v, state.spin))
+
+    def advanced(self, state, q, v, duration):
+        orientation = state.orientation
+        if orientation is not None:  # the spin is constant in flight, so that the rotation is exact
+            angle = jnp.stack([jnp.asarray(w * duration, dtype=orientation.dtype) for w in state.spin])
+            orientation = turned(orientation, angle)
+        return Flight(q, v, state.spin, orientation)
+
+    def impact(self, contact, time, state):
+        """Theorem 5.2 for any normal and any law."""
+        ball, x = self.ball, state.position
+        n = select_vector(contact, [surface.direction(x, time) for surface in self.surfaces])
+        e_n = select(contact, [surface.law.restitution for surface in self.surfaces])
+        closing = dot(n, state.velocity)
+        contact_velocity = subtract(state.velocity, scale(ball.radius, cross(state.spin, n)))
+        slip = subtract(contact_velocity, scale(closing, n))
+        sizes = (ball.inertia_ratio, abs(closing), dot(slip, slip))
+        s = select(contact, [surface.law.slip_factor(*sizes) for surface in self.surfaces])
+        kick = add(scale(times(plus(1.0, e_n), closing), n), scale(s, slip))
+        twist = times(s, ratio(1.0, times(ball.inertia_ratio, ball.radius)))
+        spin = add(state.spin, scale(twist, cross(n, slip)))
+        return Flight(x, subtract(state.velocity, kick), spin, state.orientation)
+
+    def level(self, contact, time, q):
+        return self.surfaces[contact].level(q, time, self.ball.radius)
+
+    def reach(self, contact, q):
+        return self.surfaces[contact].reach(q, self.ball.radius)
+
+    def bend(self, contact, time, window: Window):
+        return self.surfaces[contact].bend(window, time, self.ball.radius)
+
+    def is_bounded(self, contact):
+        return self.surfaces[contact].is_bounded()
+
+    def extent(self, contact):
+        return plus(self.surfaces[contact].extent(), self.ball.radius)
+
+    def is_admissible(self, time, state):
+        leaves = jax.tree.leaves((self, state))
+        holds = [jnp.all(jnp.isfinite(jnp.asarray(leaf))) for leaf in leaves]
+        holds += [jnp.asarray(value > 0) for value in (self.ball.radius, self.ball.mass, self.ball.inertia_ratio)]
+        for i, surface in enumerate(self.surfaces):
+            checks = [*surface.is_proper(self.ball.radius), *surface.law.admissible()]
+            holds += [jnp.asarray(check) for check, _ in checks]
+            holds.append(self.level(i, time, state.position) >= -16.0 * rounding(self, i, state.position))
+        return jnp.all(jnp.stack(holds))
+
+    def unpacked(self, state: BallState) -> Flight:
+        dtype = state.position.dtype
+        parts = [components(x.astype(dtype)) for x in (state.position, state.velocity, state.spin)]
+        orientation = state.orientation
+        return Flight(*parts, None if orientation is None else orientation.astype(dtype))  # pyright: ignore
+
+    def packed(self, state: Flight) -> BallState:
+        parts = [jnp.stack(x, axis=-1) for x in (state.position, state.velocity, state.spin)]
+        return BallState(*parts, state.orientation)
+
+    def contact_frame(self, contact, time, state: Flight):
+        n = select_vector(contact, [surface.direction(state.position, time) for surface in self.surfaces])
+        n = tuple(jnp.asarray(c, dtype=time.dtype) for c in n)
+        point = subtract(state.position, scale(self.ball.radius, n))
+        return jnp.stack(point), jnp.stack(n)
+
+    def without_contacts(self) -> "Scene":
+        return Scene(self.ball, {}, self.gravity, self.air)

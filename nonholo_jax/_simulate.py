@@ -1,0 +1,216 @@
+"""The two functions that run a simulation: check, choose the motion, run, package."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ._loop import run
+from ._motion import AbstractMotion, Exact
+from ._motion_integrated import Integrated
+from ._system import AbstractSystem
+from ._trajectory import Trajectory, packaged
+from ._types import is_failure, result_message, result_name
+
+
+class SimulationError(RuntimeError):
+    """A motion could not be computed; the message is that of its result."""
+
+
+def simulate(
+    scene: AbstractSystem,
+    state: Any,
+    *,
+    t1: Any,
+    t0: Any = 0.0,
+    max_impacts: int = 64,
+    log_size: int | None = None,
+    motion: AbstractMotion | None = None,
+    adjoint: Any = None,
+    throw: bool = True,
+) -> Trajectory:
+    """Move a state from `t0` to `t1` through its impacts.
+
+    **Arguments:**
+
+    - `scene`: a `Scene`.
+    - `state`: a `BallState` with fields of shape (3,). The dtype of the whole computation follows its position.
+    - `t1`, `t0`: times in s, t1 >= t0. Traced, so that a new value is no recompilation.
+    - `max_impacts`: >= 0. A motion that arrives at one impact more stops there, before it, with
+        `RESULTS.max_impacts`.
+    - `log_size`: rows of the log; `None` for `max_impacts`, 0 for none.
+    - `motion`: `Exact()` or `Integrated(...)`; `None` picks `Exact()` where the scene allows it, else `Integrated()`.
+    - `adjoint`: how derivatives are taken. `None` finds the path without derivatives and repeats it with them, in
+        both modes. `diffrax.ForwardMode()` differentiates the loop itself, forward only, first derivatives only.
+        `diffrax.RecursiveCheckpointAdjoint()` likewise, reverse only.
+    - `throw`: raise failures. Inside `vmap` they are always returned, lane by lane, in `Trajectory.result`.
+
+    Returns a `Trajectory`. Differentiable, in both modes and to second order, in the state, the times and every number
+    of the scene that is a JAX array. Raises `ValueError` for arguments that cannot be right, and `SimulationError`
+    where the motion failed (`RESULTS` says how it can).
+
+    ```python
+    from nonholo_jax import Ball, BallState, Plane, Rough, Scene, simulate
+    scene = Scene(Ball(0.025, 0.046), {"floor": Plane((0, 0, 0), (0, 0, 1), Rough())})
+    trajectory = simulate(scene, BallState([0, 0, 1], [1, 0, 0], [0, 0, 0]), t1=1.0)
+    trajectory.final.position, trajectory.n_impacts
+    ```
+    """
+    motion, log_rows = _checked(scene, motion, max_impacts, log_size)
+    _check_shapes(state, batch=False)
+    dtype = jax.tree.leaves(state)[0].dtype
+    t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
+    _check_times(t0, t1)
+    trajectory = _run(scene, motion, state, t0, t1, max_impacts, log_rows, adjoint)
+    return _raised(trajectory) if throw else trajectory
+
+
+def simulate_batch(
+    scene: AbstractSystem,
+    states: Any,
+    *,
+    t1: Any,
+    t0: Any = 0.0,
+    scene_axes: Any = None,
+    max_impacts: int = 64,
+    log_size: int | None = None,
+    motion: AbstractMotion | None = None,
+    adjoint: Any = None,
+    throw: bool = False,
+) -> Trajectory:
+    """`simulate` for many states at once, and if wanted for many scenes.
+
+    **Arguments:** as `simulate`, but every field of `states` has a leading axis N, and
+
+    - `scene_axes`: as `in_axes` of `vmap`, for scene parameters that are sampled: `None` for one scene for all; 0 if
+        every JAX array of the scene has a leading axis N; or a pytree of these in the shape of the scene.
+    - `throw`: False by default: one failed lane must not lose a batch. Each lane has its own `Trajectory.result`.
+
+    Returns a `Trajectory` with a leading axis N.
+
+    ```python
+    import jax, jax.numpy as jnp
+    from nonholo_jax import Ball, BallState, Plane, Rough, Scene, simulate_batch
+    scene = Scene(Ball(0.025, 0.046), {"floor": Plane((0, 0, 0), (0, 0, 1), Rough())})
+    spin = jax.random.normal(jax.random.key(0), (1000, 3))
+    throws = BallState(jnp.ones((1000, 3)), jnp.zeros((1000, 3)), spin)
+    simulate_batch(scene, throws, t1=1.0).final.position.mean(axis=0)
+    ```
+    """
+    motion, log_rows = _checked(scene, motion, max_impacts, log_size)
+    _check_shapes(states, batch=True)
+    dtype = jax.tree.leaves(states)[0].dtype
+    t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
+    _check_times(t0, t1)
+    trajectory = _run_batch(scene, motion, states, t0, t1, scene_axes, max_impacts, log_rows, adjoint)
+    return _raised(trajectory) if throw else trajectory
+
+
+@eqx.filter_jit
+def _run(scene, motion, state, t0, t1, max_impacts: int, log_rows: int, adjoint) -> Trajectory:
+    options = {"max_impacts": max_impacts, "log_rows": log_rows, "adjoint": adjoint}
+    outcome = run(scene, motion, scene.unpacked(state), t0, t1, **options)
+    return packaged(scene, motion, state, t0, outcome)
+
+
+@eqx.filter_jit
+def _run_batch(scene, motion, states, t0, t1, scene_axes, max_impacts: int, log_rows: int, adjoint) -> Trajectory:
+    axes = _axes(scene, scene_axes)
+    leaves, treedef = jax.tree.flatten(scene)
+    mapped = [leaf for leaf, axis in zip(leaves, axes, strict=True) if axis is not None]
+    options = {"max_impacts": max_impacts, "log_rows": log_rows, "adjoint": adjoint}
+
+    def one(state, mapped):
+        own = iter(mapped)
+        each = [leaf if axis is None else next(own) for leaf, axis in zip(leaves, axes, strict=True)]
+        system = jax.tree.unflatten(treedef, each)
+        outcome = run(system, motion, system.unpacked(state), t0, t1, **options)
+        whole = packaged(system, motion, state, t0, outcome)
+        return dataclasses.replace(whole, system=None, motion=None)
+
+    in_axes = (0, [axis for axis in axes if axis is not None])
+    whole = jax.vmap(one, in_axes=in_axes)(states, mapped)
+    flags = tuple(axis is not None for axis in axes) + (False,) * len(jax.tree.leaves(motion))
+    moved = [leaf if axis is None else jnp.moveaxis(leaf, axis, 0) for leaf, axis in zip(leaves, axes, strict=True)]
+    return dataclasses.replace(whole, system=jax.tree.unflatten(treedef, moved), motion=motion, mapped=flags)
+
+
+def _axes(scene: Any, scene_axes: Any) -> list:
+    """The mapped axis of every leaf of the scene, or None."""
+    spread: list = []
+    is_none = lambda x: x is None  # noqa: E731
+    if is_none(scene_axes) or isinstance(scene_axes, int):
+        spread = [scene_axes] * len(jax.tree.leaves(scene))
+    else:
+        jax.tree.map(
+            lambda axis, part: spread.extend([axis] * len(jax.tree.leaves(part))), scene_axes, scene, is_leaf=is_none
+        )
+    leaves = jax.tree.leaves(scene)
+    return [axis if eqx.is_array(leaf) else None for axis, leaf in zip(spread, leaves, strict=True)]
+
+
+def _checked(scene: Any, motion: Any, max_impacts: int, log_size: int | None) -> tuple[AbstractMotion, int]:
+    if not isinstance(scene, AbstractSystem):
+        raise ValueError(
+            f"Argument `scene` must be a Scene, but got {type(scene).__name__}; try Scene(ball, surfaces)."
+        )
+    for name, value in (("max_impacts", max_impacts), ("log_size", 0 if log_size is None else log_size)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+            raise ValueError(f"Argument `{name}` must be a whole number of at least 0, but got {value!r}; try 64.")
+    if motion is None:
+        bounded = all(scene.is_bounded(i) for i in range(scene.n_contacts))
+        motion = Exact() if scene.uniform_acceleration() is not None and bounded else Integrated()
+    if not isinstance(motion, AbstractMotion):
+        raise ValueError(f"Argument `motion` must be None, Exact() or Integrated(), but got {motion!r}; try None.")
+    motion.check(scene)
+    return motion, max_impacts if log_size is None else log_size
+
+
+def _check_shapes(state: Any, batch: bool) -> None:
+    names = [("position", 3), ("velocity", 3), ("spin", 3), ("orientation", 4)]
+    sizes = set()
+    for name, n in names:
+        x = getattr(state, name, None)
+        if x is None:
+            continue
+        want = f"(N, {n})" if batch else f"({n},)"
+        if x.ndim != (2 if batch else 1) or x.shape[-1] != n:
+            other = "simulate() for one state" if batch else "simulate_batch() or vmap for a batch"
+            raise ValueError(f"Argument `state.{name}` must have shape {want}, but got {x.shape}; try {other}.")
+        sizes.add(x.shape[0] if batch else 1)
+    if len(sizes) > 1:
+        raise ValueError(
+            f"Argument `states` must have one batch size, but got {sorted(sizes)}; try jnp.broadcast_to on the shorter."
+        )
+
+
+def _check_times(t0: Any, t1: Any) -> None:
+    if t0.ndim or t1.ndim:
+        raise ValueError(
+            f"Arguments `t0` and `t1` must be scalars, but got shapes {t0.shape} and {t1.shape}; try vmap for several."
+        )
+    if not any(isinstance(t, jax.core.Tracer) for t in (t0, t1)) and not t1 >= t0:
+        raise ValueError(f"Argument `t1` must be at least `t0`, but got t1={t1} and t0={t0}; try exchanging them.")
+
+
+def _raised(trajectory: Trajectory) -> Trajectory:
+    """Raise for failures: now where the result is known, else when the compiled program runs."""
+    code = trajectory.result._value  # pyright: ignore[reportAttributeAccessIssue]
+    if type(code).__name__ == "BatchTracer":  # JAX has no public name for it; inside vmap nothing is raised
+        return trajectory
+    failed = is_failure(trajectory.result)
+    if isinstance(code, jax.core.Tracer):
+        return eqx.tree_at(lambda x: x.t1, trajectory, trajectory.result.error_if(trajectory.t1, failed))
+    if failed.ndim == 0 and bool(failed):
+        result = trajectory.result
+        raise SimulationError(f"{result_name(result)}: {result_message(result)} (t = {float(trajectory.t1):g} s)")
+    if failed.ndim and bool(failed.any()):
+        first = int(jnp.argmax(failed))
+        result = jax.tree.map(lambda x: x[first], trajectory.result)
+        raise SimulationError(
+            f"{int(failed.sum())} of {failed.size} lanes failed, the first of them lane {first} with "
+            f"{result_name(result)}: {result_message(result)} Try throw=False, which returns every lane."
+        )
+    return trajectory

@@ -1,0 +1,150 @@
+"""What a simulation returns."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ._loop import Outcome, run, unpack_row
+from ._motion import AbstractMotion
+from ._system import AbstractSystem
+from ._types import KINDS, RESULTS
+from ._vector import frozen
+
+
+class ImpactLog(eqx.Module):
+    """The impacts in the order in which they happened. Every field has the leading axis log_size (behind the batch
+    axis, if any); rows that are not used hold NaN, and -1 in `surface`.
+
+    - `time` in s, and `duration` in s of the arc before.
+    - `surface`: index in the order of the scene.
+    - `point` of contact in m, and unit `normal` from the surface to the ball.
+    - `before`, `after`: the state on either side of the impact; the positions are equal.
+    - `kind`: one of `KINDS`.
+    - `grazing`: True where the closing speed is below sqrt(eps) of the speed: the time of such an impact, and its
+        derivatives, are those of the branch taken, and ill-conditioned.
+    """
+
+    time: Float[Array, "*batch log"]
+    duration: Float[Array, "*batch log"]
+    surface: Int[Array, "*batch log"]
+    point: Float[Array, "*batch log d"]
+    normal: Float[Array, "*batch log d"]
+    before: Any
+    after: Any
+    kind: KINDS
+    grazing: Bool[Array, "*batch log"]
+
+
+class Trajectory(eqx.Module):
+    """One motion through its impacts, or a batch of them with a leading axis on every field.
+
+    - `final`: state at `t1`; after the impact if one happens there.
+    - `t1`: time reached in s. Earlier than asked for if the motion ended otherwise: see `result`.
+    - `impacts`: an `ImpactLog`; `n_impacts`, how many there were (the log may hold fewer).
+    - `n_arcs`: pieces of smooth motion computed: flights with `Exact`, accepted steps with `Integrated`.
+    - `result`: one of `RESULTS`.
+    - `t0`, `initial`, `system`, `motion`: what the motion began with.
+    """
+
+    final: Any
+    t1: Float[Array, "*batch"]
+    impacts: ImpactLog
+    n_impacts: Int[Array, "*batch"]
+    n_arcs: Int[Array, "*batch"]
+    result: RESULTS
+    t0: Float[Array, "*batch"]
+    initial: Any
+    system: AbstractSystem
+    motion: AbstractMotion
+    mapped: tuple[bool, ...] | None = eqx.field(static=True, default=None)
+
+    def at(self, t: Any) -> Any:
+        """The state at time `t` in s (scalar or array), exact between impacts: the motion is taken up at the impact
+        before `t`, not interpolated. Right-continuous at impacts; NaN outside [t0, t1], and after the last impact
+        that was logged if the log is shorter than the motion. Returns a state with the batch axis, if any, and then
+        the axes of `t` in front. Differentiable in both modes."""
+        return _at(self, jnp.asarray(t, dtype=self.t1.dtype))
+
+
+@eqx.filter_jit
+def _at(trajectory: Trajectory, t: Any) -> Any:
+    if trajectory.n_impacts.ndim == 0:
+        flat = jax.vmap(lambda each: _at_one(trajectory, each))(t.reshape(-1))
+        return jax.tree.map(lambda x: x.reshape(*t.shape, *x.shape[1:]), flat)
+    leaves, treedef = jax.tree.flatten((trajectory.system, trajectory.motion))
+    mapped = trajectory.mapped or (True,) * len(leaves)
+    axes = [0 if each and eqx.is_array(leaf) else None for each, leaf in zip(mapped, leaves, strict=True)]
+    system_axes, motion_axes = jax.tree.unflatten(treedef, axes)
+    parts = (trajectory.system, trajectory.motion)
+    rest = dataclasses.replace(trajectory, system=None, motion=None)
+
+    def one(parts, rest):
+        return _at(dataclasses.replace(rest, system=parts[0], motion=parts[1]), t)
+
+    return eqx.filter_vmap(one, in_axes=((system_axes, motion_axes), eqx.if_array(0)))(parts, rest)
+
+
+def _at_one(trajectory: Trajectory, t: Any) -> Any:
+    """The state at one time of one motion."""
+    system, log = trajectory.system, trajectory.impacts
+    rows = log.time.shape[0]
+    end = trajectory.t1
+    start, begin = trajectory.initial, trajectory.t0
+    if rows > 0:
+        n = jnp.minimum(trajectory.n_impacts, rows)
+        past = jnp.sum((log.time <= t) & (jnp.arange(rows, dtype=n.dtype) < n))
+        row = jnp.maximum(past - 1, 0)
+        start = jax.tree.map(lambda a, b: jnp.where(past > 0, a[row], b), log.after, start)
+        begin = jnp.where(past > 0, log.time[row], begin)
+        end = jnp.where(trajectory.n_impacts > rows, log.time[rows - 1], end)
+    else:
+        end = jnp.where(trajectory.n_impacts > 0, trajectory.t0, end)
+    inside = (t >= trajectory.t0) & (t <= end)
+    free = system.without_contacts()
+    outcome = run(free, trajectory.motion, free.unpacked(start), begin, jnp.where(inside, t, begin),
+                  max_impacts=0, log_rows=0)  # fmt: skip
+    return jax.tree.map(lambda x: jnp.where(inside, x, jnp.nan), system.packed(outcome.state))
+
+
+def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any, outcome: Outcome) -> Trajectory:
+    """The user's form of an outcome."""
+    values, contact = outcome.log.values, outcome.log.contact
+    row = unpack_row(values, outcome.state)
+    used = contact >= 0
+    safe = frozen(outcome.state)  # harmless numbers for the rows that are not used
+    before = jax.tree.map(lambda a, b: jnp.where(_along(used, a), a, b), row.before, safe)
+    if system.n_contacts > 0:
+        point, normal = jax.vmap(system.contact_frame)(contact, row.time, before)
+        point, normal = (jnp.where(used[:, None], x, jnp.nan) for x in (point, normal))
+    else:
+        point = normal = jnp.full((contact.shape[0], 3), jnp.nan, t0.dtype)
+    packed_before, packed_after = jax.vmap(system.packed)(row.before), jax.vmap(system.packed)(row.after)
+    closing = jnp.abs(jnp.sum(normal * _velocity(system, row.before, normal.shape[-1]), axis=-1))
+    speed = jnp.sqrt(jnp.sum(frozen(_velocity(system, row.before, normal.shape[-1])) ** 2, axis=-1))
+    grazing = used & (closing <= float(jnp.finfo(t0.dtype).eps) ** 0.5 * speed)
+    kind = jax.vmap(lambda each: KINDS.where(each, KINDS.bounce, KINDS.unused))(used)
+    log = ImpactLog(row.time, row.duration, contact, point, normal, packed_before, packed_after, kind, grazing)
+    return Trajectory(
+        final=system.packed(outcome.state),
+        t1=outcome.time,
+        impacts=log,
+        n_impacts=outcome.n_impacts,
+        n_arcs=outcome.n_arcs,
+        result=outcome.result,
+        t0=t0,
+        initial=state,
+        system=system,
+        motion=motion,
+    )
+
+
+def _along(used: Any, x: Any) -> Any:
+    return used.reshape(used.shape + (1,) * (x.ndim - used.ndim))
+
+
+def _velocity(system: AbstractSystem, states: Any, n: int) -> Any:
+    return jax.lax.stop_gradient(jnp.stack(system.evolving(states)[1], axis=-1)[..., :n])

@@ -1,0 +1,81 @@
+"""Words shared by every file: array shapes and the ways in which a motion can end."""
+
+from typing import TypeAlias
+
+import equinox.internal as eqxi
+from jaxtyping import Array, Float, Int
+
+
+Scalar: TypeAlias = Float[Array, ""]
+Vector: TypeAlias = Float[Array, "3"]
+Quaternion: TypeAlias = Float[Array, "4"]
+Number: TypeAlias = float | Scalar
+Vector3: TypeAlias = tuple[Number, Number, Number]
+"""Inside the engine a vector is three scalars: under `vmap` each is one contiguous array, and a component that is a
+Python number is a constant of the program."""
+Index: TypeAlias = Int[Array, ""]
+
+
+class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
+    """How a motion ended. The first two are successes, the third is a stop, the others are failures."""
+
+    reached_t1 = "The motion reached `t1`."
+    at_rest = "The ball came to rest before `t1`."
+    max_impacts = (
+        "The motion was stopped on its way to one impact more than `max_impacts`. Try increasing `max_impacts`, or "
+        "read `Trajectory.t1` for the time reached."
+    )
+    step_limit = (
+        "The step limit was reached before `t1`. Try increasing `max_steps` of the motion, or loosening `rtol` and "
+        "`atol`."
+    )
+    invalid_state = (
+        "The initial state or the scene is not admissible: a value is NaN or infinite, a mass, radius or inertia is "
+        "not positive, or the ball starts inside a surface. Try moving the ball out by at least its radius."
+    )
+    no_limit = (
+        "The bounces accumulate without a limit, because the tangential restitution is 1 in size and the normal one "
+        "below 1. Try `tangential` between -1 and 1."
+    )
+    corner = (
+        "Impacts at a corner did not resolve at one instant. Try moving the throw slightly off the corner, or round "
+        "the corner off."
+    )
+    sustained_contact = (
+        "The ball stays in contact with a surface (it rests, rolls, or its bounces have died out below rounding). "
+        "Try an earlier `t1`, or read `Trajectory.t1` for the time reached."
+    )
+
+
+NAMES_OF_RESULTS = tuple(RESULTS._name_to_item)
+
+
+def is_success(result: RESULTS):
+    """True where the motion did all that was asked of it. Shape as `result`."""
+    return (result == RESULTS.reached_t1) | (result == RESULTS.at_rest)
+
+
+def is_failure(result: RESULTS):
+    """True where the motion could not be computed, so that `throw=True` raises. Shape as `result`."""
+    return ~is_success(result) & (result != RESULTS.max_impacts)
+
+
+def result_name(result: RESULTS) -> str:
+    """The name of one concrete result, such as `"reached_t1"`."""
+    return NAMES_OF_RESULTS[int(result._value)]  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def result_message(result: RESULTS) -> str:
+    """The sentence that says what one concrete result means and what to try."""
+    return RESULTS._index_to_message[int(result._value)]  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class KINDS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
+    """What one row of an `ImpactLog` stands for. `train`, `rolling` and `left` are reserved for motion after the last
+    bounce, which this version ends as `RESULTS.sustained_contact`."""
+
+    unused = "No impact in this row."
+    bounce = "One impact."
+    train = "Infinitely many impacts that end in finite time."
+    rolling = "An impact after which the ball rolls."
+    left = "The ball leaves a surface without an impact."
