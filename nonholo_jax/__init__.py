@@ -2,6 +2,8 @@
 
 from ._air import Air as Air
 from ._ball import Ball as Ball, BallState as BallState
+from ._design import Design as Design, design as design
+from ._goal import AbstractGoal as AbstractGoal, HitTarget as HitTarget, Land as Land, ReturnTo as ReturnTo
 from ._impact import collide as collide, projector as projector
 from ._law import AbstractContactLaw as AbstractContactLaw, Frictional as Frictional, Rough as Rough, Smooth as Smooth
 from ._motion import AbstractMotion as AbstractMotion, Exact as Exact

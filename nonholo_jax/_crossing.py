@@ -58,7 +58,8 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, s: Any, touching:
     q, tangent = arc.position(s), arc.tangent(s)
     left = arc.length - s
     value, rate = slope(lambda x: system.level(contact, arc.time, x), q, tangent)
-    tolerance = rounding(system, contact, q)
+    # Near the contact q may be small, but it is the sum of numbers that are not, and s is rounded too.
+    tolerance = rounding(system, contact, [evaluate(tuple(abs(c) for c in p), s) for p in arc.configuration])
     coefficients = tuple(recentred(p, s) for p in arc.configuration)
     reach = system.reach(contact, q)
     exact = reach is None and all(len(p) <= 3 for p in coefficients)
@@ -115,26 +116,37 @@ def search(system: AbstractSystem, arc: Arc, start: Any, touching: Index, n_step
     return lax.while_loop(going, lambda c: (c[0] + 1, step(c[1])), (jnp.asarray(0), state))[1]
 
 
-def rests(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Bool[Array, ""]:
-    """Whether a bounce with the closing speed at `s` would not rise above rounding: the motion stays in contact."""
+class Meeting(NamedTuple):
+    """What the level of one contact does at one local time, where it is crossed."""
+
+    value: Scalar
+    rate: Scalar
+    rests: Bool[Array, ""]  # a bounce would not rise above rounding: the motion stays in contact
+
+
+def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meeting:
     q, tangent = arc.position(s), arc.tangent(s)
     here = Window(tuple(recentred(p, s) for p in arc.configuration), 0.0)
     columns = []
     for i in range(system.n_contacts):
-        _, rate = slope(lambda x, i=i: system.level(i, arc.time, x), q, tangent)
-        columns.append((rate, system.bend(i, arc.time, here), rounding(system, i, q)))
-    rate, bend, tolerance = (select(contact, column) for column in zip(*columns, strict=True))
-    return (bend < 0) & (rate * rate <= -2.0 * bend * tolerance)
+        value, rate = slope(lambda x, i=i: system.level(i, arc.time, x), q, tangent)
+        columns.append((value, rate, system.bend(i, arc.time, here), rounding(system, i, q)))
+    value, rate, bend, tolerance = (select(contact, column) for column in zip(*columns, strict=True))
+    return Meeting(value, rate, (bend < 0) & (rate * rate <= -2.0 * bend * tolerance))  # pyright: ignore
 
 
-def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index, n_steps: int = 2) -> Scalar:
-    """The local time of a crossing found near `s`, differentiable in the arc and the system: Newton steps, of which
-    two also make second derivatives right. Where the level does not change (grazing) `s` is kept."""
+def newton(arc: Arc, s: Scalar, value: Number, rate: Number) -> Scalar:
+    """One Newton step for the zero of a level. Where it does not change (grazing) `s` is kept."""
+    steep = jnp.abs(rate) > float(jnp.finfo(s.dtype).eps) * frozen(norm(arc.tangent(s)))
+    return s - jnp.where(steep, value / jnp.where(steep, rate, 1.0), 0.0)
+
+
+def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Scalar:
+    """The local time of a crossing found near `s`, differentiable in the arc and the system: two Newton steps, so
+    that second derivatives are right too."""
     s = frozen(s)
-    for _ in range(n_steps):
+    for _ in range(2):
         q, tangent = arc.position(s), arc.tangent(s)
         pairs = [slope(lambda x, i=i: system.level(i, arc.time, x), q, tangent) for i in range(system.n_contacts)]
-        value, rate = (select(contact, column) for column in zip(*pairs, strict=True))
-        steep = jnp.abs(rate) > float(jnp.finfo(s.dtype).eps) * frozen(norm(tangent))
-        s = s - jnp.where(steep, value / jnp.where(steep, rate, 1.0), 0.0)
+        s = newton(arc, s, *(select(contact, column) for column in zip(*pairs, strict=True)))
     return s

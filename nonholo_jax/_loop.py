@@ -15,12 +15,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ._crossing import corrected, rests, search
+from ._crossing import corrected, meeting, newton, search
 from ._motion import AbstractMotion
 from ._system import AbstractSystem
 from ._types import RESULTS
-from ._vector import frozen, norm
-
+from ._vector import frozen, norm, shared
 
 _CHUNK = 16
 _MOST_IMPACTS_AT_ONCE = 32
@@ -115,6 +114,11 @@ def _write(buffer: Any, index: Any, wanted: Any, value: Any) -> Any:
     return buffer.at[jnp.where(wanted, index, rows)].set(value, mode="drop")
 
 
+def _shared(state: Any, finite: Any) -> Any:
+    leaves, treedef = jax.tree.flatten(state)
+    return jax.tree.unflatten(treedef, shared(leaves, finite))
+
+
 def _keep(condition: Any, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
@@ -154,17 +158,20 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     arc = piece.arc
     kept, control = motion.judge(c.control, size, piece.trial)
     found = search(system, arc, c.s, c.touching, motion.safe_steps)
+    found = lax.optimization_barrier(found)
     ended = kept & found.finished
     crossed = ended & (found.contact >= 0)
     through = ended & ~crossed
     s, resting = jnp.where(through, arc.length, found.s), jnp.asarray(False)
     if system.n_contacts > 0:
-        s = jnp.where(crossed, corrected(system, arc, found.s, found.contact, n_steps=1), s)
-        resting = rests(frozen(system), frozen(arc), frozen(s), found.contact)
+        met = meeting(system, arc, found.s, found.contact)
+        s, resting = jnp.where(crossed, newton(arc, s, met.value, met.rate), s), met.rests
+        (s,) = shared([s], c.since)
     elapsed = s * arc.unit
     reached = through & last
     time = jnp.where(reached, t1, c.time + elapsed)
     arrived = _arrays(system.advanced(c.state, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
+    arrived = _shared(arrived, c.since)
 
     since = c.since + elapsed
     at_once = since * norm(frozen(arc.velocity(s))) <= _tiny(system, arc, s)
@@ -253,7 +260,7 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         last = reached & (index == known.n_arcs - 1)
         left = t1 - time
         # A path without impacts since its last full step ends at t1 exactly, wherever its impacts move to.
-        whole = jnp.where(used, jnp.where(last | (motion.max_pieces(0) == 1), left, size), 0.0)
+        whole = jnp.where(used, jnp.where(last | motion.is_closed_form, left, size), 0.0)
         piece = motion.piece(system, time, state, memory, jumped, whole)
         arc = piece.arc
         crossed = used & (contact >= 0)

@@ -1,7 +1,7 @@
 """How the system moves between contacts. A motion makes arcs; the event loop cuts them at contacts."""
 
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,9 +23,10 @@ class Piece(NamedTuple):
 
 class AbstractMotion(eqx.Module):
     """Makes the arcs of a system. `safe_steps` is how many steps of the search for a crossing one turn of the loop
-    takes; `max_pieces(max_impacts)` bounds the number of arcs that a motion can be made of."""
+    takes; `is_closed_form` says that one piece reaches any time; `max_pieces(max_impacts)` bounds the number of arcs that a motion can be made of."""
 
     safe_steps: eqx.AbstractVar[int]
+    is_closed_form: eqx.AbstractClassVar[bool]
 
     @abstractmethod
     def check(self, system: AbstractSystem) -> None:
@@ -70,6 +71,7 @@ class Exact(AbstractMotion):
     """
 
     safe_steps: int = eqx.field(static=True, default=1)
+    is_closed_form: ClassVar[bool] = True
 
     def check(self, system):
         if system.uniform_acceleration() is None:

@@ -1,6 +1,6 @@
 """Motion by any explicit Diffrax solver, one step an arc, with the solver's own interpolant."""
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -11,7 +11,7 @@ import numpy as np
 from ._crossing import Arc
 from ._motion import AbstractMotion, Piece
 from ._types import Scalar
-from ._vector import frozen, plus, root, times, total
+from ._vector import frozen, plus, root, shared, times, total
 
 
 def _rms(tree: Any) -> Any:
@@ -54,6 +54,7 @@ class Integrated(AbstractMotion):
     dt0: Any = None
     max_steps: int = eqx.field(static=True, default=4096)
     safe_steps: int = eqx.field(static=True, default=8)
+    is_closed_form: ClassVar[bool] = False
 
     def __check_init__(self):
         explicit = isinstance(self.solver, diffrax.AbstractERK) or not isinstance(
@@ -166,7 +167,7 @@ def _unrolled_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -> P
         z = [plus(x, _combination(row, [k[j] for k in stages])) for j, x in enumerate((*q, *v))]
         c = 0.0 if i == 0 else float(tableau.c[i - 1])
         a = system.acceleration(time + c * h, state, tuple(z[:n]), tuple(z[n:]))
-        stages.append([h * x for x in (*z[n:], *a)])
+        stages.append(shared([h * x for x in (*z[n:], *a)], h))
     z0 = (*q, *v)
     columns = [[k[j] for k in stages] for j in range(2 * n)]
     steps = [_combination(tableau.b_sol, column) for column in columns]

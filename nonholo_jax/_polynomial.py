@@ -7,7 +7,6 @@ from typing import NamedTuple
 from ._types import Number
 from ._vector import is_constant, maximum, minimum, plus, times, total
 
-
 Polynomial = tuple[Number, ...]  # coefficients, constant term first
 
 

@@ -58,8 +58,8 @@ class Trajectory(eqx.Module):
     result: RESULTS
     t0: Float[Array, "*batch"]
     initial: Any
-    system: AbstractSystem
-    motion: AbstractMotion
+    system: Any  # an AbstractSystem
+    motion: Any  # an AbstractMotion
     mapped: tuple[bool, ...] | None = eqx.field(static=True, default=None)
 
     def at(self, t: Any) -> Any:
@@ -105,9 +105,16 @@ def _at_one(trajectory: Trajectory, t: Any) -> Any:
         end = jnp.where(trajectory.n_impacts > 0, trajectory.t0, end)
     inside = (t >= trajectory.t0) & (t <= end)
     free = system.without_contacts()
-    outcome = run(free, trajectory.motion, free.unpacked(start), begin, jnp.where(inside, t, begin),
-                  max_impacts=0, log_rows=0)  # fmt: skip
-    return jax.tree.map(lambda x: jnp.where(inside, x, jnp.nan), system.packed(outcome.state))
+    until = jnp.where(inside, t, begin)
+    state, motion = free.unpacked(start), trajectory.motion
+    if motion.is_closed_form:
+        piece = motion.piece(free, begin, state, None, jnp.asarray(True), until - begin)
+        arc, s = piece.arc, piece.arc.length
+        end_state = free.advanced(state, arc.position(s), arc.velocity(s), s * arc.unit)
+        end_state = jax.tree.map(lambda x: jnp.asarray(x, dtype=t.dtype), end_state)
+    else:
+        end_state = run(free, motion, state, begin, until, max_impacts=0, log_rows=0).state
+    return jax.tree.map(lambda x: jnp.where(inside, x, jnp.nan), system.packed(end_state))
 
 
 def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any, outcome: Outcome) -> Trajectory:

@@ -5,7 +5,6 @@ from typing import TypeAlias
 import equinox.internal as eqxi
 from jaxtyping import Array, Float, Int
 
-
 Scalar: TypeAlias = Float[Array, ""]
 Vector: TypeAlias = Float[Array, "3"]
 Quaternion: TypeAlias = Float[Array, "4"]

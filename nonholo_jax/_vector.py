@@ -17,7 +17,7 @@ def is_constant(x: Any) -> bool:
     return isinstance(x, float | int)
 
 
-def as_number(x: Any) -> Number:
+def as_number(x: Any) -> Any:
     """A Python float for Python and NumPy numbers; JAX arrays stay as they are (integers become floating)."""
     if isinstance(x, jax.Array):
         return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
@@ -161,3 +161,11 @@ def slope(function: Callable, at: Sequence, along: Sequence) -> tuple[Number, Nu
 def frozen(tree: Any) -> Any:
     """The same values without derivatives; constants stay constants."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, tree)
+
+
+def shared(values: Sequence[Any], finite: Any) -> list:
+    """The same numbers, computed once. XLA's fusion on the CPU copies whatever is cheap into all of its consumers, and
+    their consumers, so that a chain of stages is recomputed for every output; a division it never copies. So divide by
+    a one that it cannot see through; `finite` is any traced finite number."""
+    one = 1.0 + 0.0 * frozen(finite)
+    return [value if is_constant(value) else value / one for value in values]

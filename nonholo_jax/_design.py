@@ -1,0 +1,339 @@
+"""Inverse problems: which throw, or which scene, reaches a goal."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from ._ball import BallState
+from ._goal import AbstractGoal
+from ._names import expand, read, write
+from ._scene import Scene
+from ._simulate import simulate
+from ._trajectory import Trajectory
+from ._types import RESULTS, is_failure, result_name
+
+_CANDIDATES_PER_START = 64
+_REFUSED = 1e3  # residual, in m, of a motion that fails or leaves the itinerary: worse than any that does not
+
+
+class Starts(eqx.Module):
+    """What each start of the search did; leading axis n_starts. `initial` and `found` hold the free numbers in the
+    order of `Design.names`, `miss` is in m, `met` says whether the itinerary was kept, `steps` counts those of the
+    solver, `hit` lists surface indices (-1: none)."""
+
+    initial: Float[Array, "n d"]
+    found: Float[Array, "n d"]
+    miss: Float[Array, " n"]
+    met: Bool[Array, " n"]
+    steps: Int[Array, " n"]
+    hit: Int[Array, "n log"]
+    result: RESULTS
+
+
+class Design(eqx.Module):
+    """The answer of `design`.
+
+    - `state`, `scene`: with the free numbers that were found; `names` and `values`: which ones, and what they are.
+    - `miss`: norm of the goal's residual, in m; `loss`: half its square.
+    - `converged`: the miss is within the tolerance, along the itinerary asked for.
+    - `itinerary`: names of the surfaces hit; `trajectory`: the motion, up to the goal.
+    - `starts`: what each start did; `evaluations`: how many trajectories were computed (with derivatives or without).
+    """
+
+    state: BallState
+    scene: Scene
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: Float[Array, " d"]
+    loss: Float[Array, ""]
+    miss: Float[Array, ""]
+    converged: bool = eqx.field(static=True)
+    itinerary: tuple[str, ...] = eqx.field(static=True)
+    trajectory: Trajectory
+    starts: Starts
+    evaluations: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+
+    def report(self) -> list[str]:
+        """One line for each start: where it began, what it found, and why it is no answer if it is none."""
+        lines = []
+        for i in range(self.starts.miss.shape[0]):
+            begun, ended = (
+                ", ".join(f"{name.removeprefix('throw.')} = {float(x):.6g}" for name, x in zip(self.names, xs, strict=True))
+                for xs in (self.starts.initial[i], self.starts.found[i])
+            )  # fmt: skip
+            lines.append(f"from {begun} to {ended}: {self._verdict(i)}")
+        return lines
+
+    def _verdict(self, i: int) -> str:
+        each = jax.tree.map(lambda x: x[i], self.starts)
+        hit = ", ".join(self.scene.names[int(j)] for j in each.hit if int(j) >= 0) or "nothing"
+        if bool(is_failure(each.result)):
+            return f"the motion failed ({result_name(each.result)})"
+        if not bool(each.met):
+            return f"left the itinerary (hit {hit})"
+        if float(each.miss) <= self.tolerance:
+            return f"reached the goal (miss {float(each.miss):.3g} m)"
+        return f"came no closer than {float(each.miss):.3g} m (hit {hit})"
+
+
+def design(
+    scene: Scene,
+    state: BallState,
+    *,
+    free: Sequence[str],
+    goal: AbstractGoal | Callable[[Trajectory], Any],
+    itinerary: Sequence[str] | None = None,
+    bounds: Mapping[str, Sequence[float]] | None = None,
+    n_starts: int = 16,
+    key: Any = None,
+    t1: Any,
+    t0: Any = 0.0,
+    max_impacts: int = 64,
+    motion: Any = None,
+    solver: Any = None,
+    tolerance: float | None = None,
+    max_steps: int = 64,
+) -> Design:
+    """Find the free numbers with which a throw reaches a goal, by gradient through its impacts, from many starts.
+
+    **Arguments:**
+
+    - `scene`, `state`: what is not free, and a first guess of what is.
+    - `free`: names such as `"spin.y"`, `"velocity"`, `"surfaces.table.law.restitution"`, `"ball.radius"`.
+    - `goal`: `ReturnTo`, `HitTarget`, `Land`, or any differentiable function of a `Trajectory` that returns an array
+        which is zero where the goal is reached.
+    - `itinerary`: names of the surfaces that must be hit first, in order. A motion that hits others is refused.
+    - `bounds`: for a name, the pair (lowest, highest); infinite ones are allowed.
+    - `n_starts`: how many local searches; they begin at the best of 64 times as many random candidates, and at
+        `state` itself. `key`: of the random candidates (default: `jax.random.key(0)`).
+    - `t1`, `t0`, `max_impacts`, `motion`: as in `simulate`.
+    - `solver`: an `optimistix` least-squares solver (default: Levenberg-Marquardt) or minimiser, or an `optax`
+        optimiser. `max_steps`: of each local search.
+    - `tolerance`: on the miss; by default 1e-6 m in float64, 1e-3 m in float32.
+
+    Returns a `Design`: of the answers found the one nearest to the first guess, or, if there is none, the closest
+    miss, with `converged=False` and the report of every start. Raises `ValueError` for names that do not exist.
+
+    ```python
+    from nonholo_jax import Ball, BallState, Plane, ReturnTo, Rough, Scene, design
+    scene = Scene(Ball(0.025, 0.046), {"floor": Plane((0, 0, 0), (0, 0, 1), Rough())})
+    throw = BallState([0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    answer = design(scene, throw, free=["spin.y"], goal=ReturnTo([0.0, 0.0, 1.0]), itinerary=["floor"], t1=2.0)
+    answer.values                                            # r m v / J, section 5.2.1 of the paper
+    ```
+    """
+    names = expand(scene, state, free)
+    if not names:
+        raise ValueError("Argument `free` must name at least one number, but got none; try ['spin.y'].")
+    dtype = state.position.dtype
+    tolerance = (1e-6 if dtype == jnp.float64 else 1e-3) if tolerance is None else tolerance
+    wanted = _wanted(scene, itinerary)
+    times = (jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
+    problem = _Problem(scene, state, goal, *times, names, wanted, max_impacts, motion)
+    first = read(scene, state, names)
+    chart = _chart(scene, state, names, first, _limits(scene, state, names, bounds or {}, dtype))
+    key = jax.random.key(0) if key is None else key
+    initial = _starts(problem, chart, first, n_starts, key)
+    solver = _least_squares_solver(solver)
+    found, (miss, met, hit, result, time), steps = _descend(problem, chart, initial, solver, max_steps)
+    starts = Starts(jax.vmap(chart.value)(initial), jax.vmap(chart.value)(found), miss, met, steps, hit, result)
+    best = _best(starts, chart, first, tolerance)
+    values = starts.found[best]
+    scene, state = write(scene, state, names, values)
+    end = time[best] if jnp.isfinite(time[best]) else problem.t1
+    trajectory = problem.trajectory(values, end)  # up to the goal: the picture and the report end there
+    evaluations = n_starts * _CANDIDATES_PER_START + int(jnp.sum(steps))
+    return Design(
+        state=state,
+        scene=scene,
+        names=names,
+        values=values,
+        loss=0.5 * miss[best] ** 2,
+        miss=miss[best],
+        converged=bool(met[best] & (miss[best] <= tolerance)),
+        itinerary=tuple(scene.names[int(i)] for i in trajectory.impacts.surface if int(i) >= 0),
+        trajectory=trajectory,
+        starts=starts,
+        evaluations=evaluations,
+        tolerance=float(tolerance),
+    )
+
+
+class _Problem(eqx.Module):
+    """Everything but the free numbers."""
+
+    scene: Scene
+    state: BallState
+    goal: Any
+    t0: Array
+    t1: Array
+    names: tuple[str, ...] = eqx.field(static=True)
+    wanted: tuple[int, ...] | None = eqx.field(static=True)
+    max_impacts: int = eqx.field(static=True)
+    motion: Any
+
+    def trajectory(self, values: Any, t1: Any = None) -> Trajectory:
+        scene, state = write(self.scene, self.state, self.names, values)
+        most = self.max_impacts if self.wanted is None else len(self.wanted)
+        t1 = self.t1 if t1 is None else t1
+        return simulate(scene, state, t1=t1, t0=self.t0, max_impacts=most, motion=self.motion, throw=False)
+
+    def residual(self, values: Any) -> tuple[Any, tuple]:
+        """The goal's residual, refused where the motion is none that was asked for; and what happened."""
+        trajectory = self.trajectory(values)
+        if isinstance(self.goal, AbstractGoal):
+            required = None if self.wanted is None else len(self.wanted)
+            residual, time = self.goal.residual(trajectory, required)
+        else:
+            residual, time = jnp.ravel(self.goal(trajectory)), trajectory.t1
+        met = self.met(trajectory) & jnp.all(jnp.isfinite(residual))
+        ok = met & (trajectory.result != RESULTS.invalid_state)
+        miss = jnp.sqrt(jnp.sum(jnp.where(ok, jax.lax.stop_gradient(residual), 0.0) ** 2))
+        aside = (jnp.where(ok, miss, jnp.inf), met, trajectory.impacts.surface, trajectory.result, time)
+        return jnp.where(ok, residual, _REFUSED), aside
+
+    def met(self, trajectory: Trajectory) -> Any:
+        if self.wanted is None:
+            return trajectory.n_impacts >= 0
+        return jnp.all(trajectory.impacts.surface == jnp.asarray(self.wanted, dtype=jnp.int32))
+
+
+class _Chart(eqx.Module):
+    """Free numbers from coordinates without bounds, all of order one (the transformations of MINUIT)."""
+
+    centre: Array
+    scale: Array
+    low: Array
+    high: Array
+
+    def value(self, u: Any) -> Any:
+        below, above = jnp.isfinite(self.low), jnp.isfinite(self.high)
+        low, high = jnp.where(below, self.low, 0.0), jnp.where(above, self.high, 0.0)
+        rise = self.scale * (jnp.sqrt(u * u + 1.0) - 1.0)
+        one_sided = jnp.where(below, low + rise, high - rise)
+        two_sided = low + 0.5 * (high - low) * (1.0 + jnp.sin(u))
+        return jnp.where(below & above, two_sided, jnp.where(below | above, one_sided, self.centre + self.scale * u))
+
+    def coordinate(self, x: Any) -> Any:
+        below, above = jnp.isfinite(self.low), jnp.isfinite(self.high)
+        low, high = jnp.where(below, self.low, 0.0), jnp.where(above, self.high, 1.0)
+        rise = jnp.maximum(jnp.where(below, x - low, high - x), 0.0) / self.scale + 1.0
+        one_sided = jnp.sqrt(rise * rise - 1.0)
+        width = jnp.where(high > low, high - low, 1.0)
+        two_sided = jnp.arcsin(jnp.clip(2.0 * (x - low) / width - 1.0, -0.999999, 0.999999))
+        return jnp.where(below & above, two_sided, jnp.where(below | above, one_sided, (x - self.centre) / self.scale))
+
+
+def _limits(scene, state, names, bounds: Mapping[str, Sequence[float]], dtype) -> tuple[Array, Array]:
+    low, high = [-jnp.inf] * len(names), [jnp.inf] * len(names)
+    for name, pair in bounds.items():
+        for full in expand(scene, state, [name]):
+            if full not in names:
+                raise ValueError(
+                    f"Argument `bounds` must name free numbers, but got {name!r}; try adding it to `free`."
+                )
+            if len(pair) != 2 or not pair[0] < pair[1]:
+                raise ValueError(
+                    f"Argument `bounds[{name!r}]` must be (lowest, highest), but got {pair}; try exchanging."
+                )
+            low[names.index(full)], high[names.index(full)] = pair
+    return jnp.asarray(low, dtype=dtype), jnp.asarray(high, dtype=dtype)
+
+
+def _chart(scene, state, names, first: Any, limits: tuple) -> _Chart:
+    """Coordinates in which one is a natural step: a rolling spin for spins, the speed for velocities."""
+    speed = float(jnp.sqrt(jnp.sum(state.velocity**2))) or 1.0
+    natural = {"throw.velocity": speed, "throw.spin": speed / float(scene.ball.radius), "throw.position": 1.0}
+    sizes = [natural.get(name.rsplit(".", 1)[0], abs(float(x)) or 1.0) for name, x in zip(names, first, strict=True)]
+    low, high = limits
+    return _Chart(first, jnp.asarray(sizes, dtype=first.dtype), low, high)
+
+
+def _wanted(scene: Scene, itinerary: Sequence[str] | None) -> tuple[int, ...] | None:
+    if itinerary is None:
+        return None
+    for name in itinerary:
+        scene.surface(name)
+    return tuple(scene.names.index(name) for name in itinerary)
+
+
+def _least_squares_solver(solver: Any) -> Any:
+    if solver is None:
+        return optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
+    if isinstance(solver, optax.GradientTransformation):
+        return optx.OptaxMinimiser(solver, rtol=1e-10, atol=1e-12)
+    if not isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
+        raise ValueError(
+            f"Argument `solver` must be an optimistix or optax solver, but got {solver!r}; try "
+            "optimistix.LevenbergMarquardt(rtol=1e-12, atol=1e-12)."
+        )
+    return solver
+
+
+def _starts(problem: _Problem, chart: _Chart, first: Any, n_starts: int, key: Any) -> Any:
+    """The first guess and the best of many random candidates, in coordinates."""
+    shape = (n_starts * _CANDIDATES_PER_START - 1, first.size)
+    bounded = jnp.isfinite(chart.low) & jnp.isfinite(chart.high)
+    spread, flat = jax.random.split(key)
+    normal = jax.random.normal(spread, shape, first.dtype)
+    uniform = jax.random.uniform(flat, shape, first.dtype, minval=-1.0, maxval=1.0)
+    u = jnp.concatenate([chart.coordinate(first)[None], jnp.where(bounded, jnp.arcsin(uniform), normal)])
+    miss = _screen(problem, chart, u)
+    order = jnp.argsort(jnp.where(jnp.arange(u.shape[0]) == 0, -1.0, miss))  # the first guess always takes part
+    return u[order[:n_starts]]
+
+
+@eqx.filter_custom_jvp
+def _residual(u: Any, *, problem: _Problem, chart: _Chart) -> tuple[Any, tuple]:
+    return problem.residual(chart.value(u))
+
+
+@_residual.def_jvp
+def _residual_jvp(primals, tangents, *, problem: _Problem, chart: _Chart):
+    """The whole Jacobian in one forward pass, and its product with the tangent. A solver that linearizes the residual
+    then compiles this one program, instead of a value, its linearization and what reverse mode would want to keep."""
+    (u,), (du,) = primals, tangents
+    push = lambda e: jax.jvp(lambda u: problem.residual(chart.value(u)), (u,), (e,), has_aux=True)  # noqa: E731
+    value, columns, aside = jax.vmap(push, out_axes=(None, 1, None))(jnp.eye(u.size, dtype=u.dtype))
+    return (value, aside), (columns @ du, jax.tree.map(lambda _: None, aside))
+
+
+@eqx.filter_jit
+def _screen(problem: _Problem, chart: _Chart, u: Any) -> Any:
+    return jax.vmap(lambda each: problem.residual(chart.value(each))[1][0])(u)
+
+
+def _loss(u: Any, problem: _Problem, chart: _Chart) -> tuple[Any, tuple]:
+    residual, aside = _residual(u, problem=problem, chart=chart)
+    return 0.5 * jnp.sum(residual**2), aside
+
+
+@eqx.filter_jit
+def _descend(problem: _Problem, chart: _Chart, initial: Any, solver: Any, max_steps: int) -> tuple:
+    def one(u):
+        options = {"max_steps": max_steps, "throw": False, "has_aux": True}
+        if isinstance(solver, optx.AbstractLeastSquaresSolver):
+            solution = optx.least_squares(lambda u, _: _residual(u, problem=problem, chart=chart), solver, u, **options)
+        else:
+            solution = optx.minimise(lambda u, _: _loss(u, problem, chart), solver, u, **options)
+        return solution.value, solution.aux, solution.stats["num_steps"]
+
+    return jax.vmap(one)(initial)
+
+
+def _best(starts: Starts, chart: _Chart, first: Any, tolerance: float) -> int:
+    """Of the starts that reached the goal the one nearest to the first guess; else the closest miss."""
+    reached = starts.met & (starts.miss <= tolerance)
+    distance = jnp.sum(((starts.found - first) / chart.scale) ** 2, axis=-1)
+    if bool(jnp.any(reached)):
+        # Several starts end at one answer up to rounding: take the most exact of those.
+        nearest = jnp.min(jnp.where(reached, distance, jnp.inf))
+        same = reached & (distance <= nearest * (1.0 + 1e-6) + 1e-12)
+        return int(jnp.argmin(jnp.where(same, starts.miss, jnp.inf)))
+    return int(jnp.argmin(starts.miss))

@@ -1,0 +1,125 @@
+"""What a throw is designed for."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ._trajectory import Trajectory
+from ._types import Scalar
+from ._vector import frozen
+
+_ON_ONE_ARC = 33
+_ON_ALL_ARCS = 257
+_ROUNDS = 3
+_NEWTON_STEPS = 4
+
+
+class AbstractGoal(eqx.Module):
+    """A differentiable residual of a trajectory, zero where the goal is reached."""
+
+    @abstractmethod
+    def residual(self, trajectory: Trajectory, n_required: int | None) -> tuple[Float[Array, " n"], Scalar]:
+        """The residual, and the time at which the goal is closest. `n_required` is the length of the itinerary (the
+        trajectory then stops before the impact after it), or `None` without one."""
+
+
+class ReturnTo(AbstractGoal):
+    """The ball's centre comes back to `point` (in m, shape (3,)) on the arc after the itinerary's last impact, or,
+    without an itinerary, on any arc after the first impact. The residual is the vector of closest approach."""
+
+    point: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
+
+    def residual(self, trajectory, n_required):
+        return _closest_approach(trajectory, self.point, 1 if n_required is None else n_required, n_required is None)
+
+
+class HitTarget(AbstractGoal):
+    """The ball's centre passes through `point` (in m, shape (3,)) on the arc after the itinerary's last impact, or,
+    without an itinerary, on any arc, the first included."""
+
+    point: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
+
+    def residual(self, trajectory, n_required):
+        return _closest_approach(trajectory, self.point, n_required or 0, n_required is None)
+
+
+class Land(AbstractGoal):
+    """The contact point of an impact is at `point` (in m, shape (3,)): of the itinerary's last impact, or, without an
+    itinerary, of the first impact on the surface named `surface` (on any surface if `None`)."""
+
+    point: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
+    surface: str | None = eqx.field(static=True, default=None)
+
+    def residual(self, trajectory, n_required):
+        log = trajectory.impacts
+        if n_required is not None:
+            row = jnp.asarray(n_required - 1)
+        else:
+            names = trajectory.system.names  # pyright: ignore[reportAttributeAccessIssue]
+            wanted = log.surface >= 0 if self.surface is None else log.surface == names.index(self.surface)
+            row = jnp.argmax(wanted)
+        return log.point[row] - self.point.astype(log.point.dtype), log.time[row]
+
+
+def _closest_approach(trajectory: Trajectory, point: Any, first: int, everywhere: bool) -> tuple[Any, Any]:
+    """The vector from `point` to the nearest point of the path after impact number `first`, and its time. A sample
+    near it is found without derivatives; from there the path is a parabola (to rounding, if not exactly), on which
+    Newton's method finds the closest approach, and its last step carries the derivatives."""
+    point = point.astype(trajectory.t1.dtype)
+    log = trajectory.impacts
+    begin = trajectory.t0 if first == 0 else log.time[first - 1]
+    if trajectory.motion.is_closed_form and not everywhere:
+        state = trajectory.initial if first == 0 else jax.tree.map(lambda x: x[first - 1], log.after)
+        t, low, high = begin, jnp.zeros_like(begin), frozen(trajectory.t1 - begin)
+    else:
+        low, high, t = _bracket(frozen(trajectory), point, frozen(begin), everywhere)
+        state, low, high = trajectory.at(t), low - t, high - t
+    inner = trajectory.system.unpacked(state)
+    pull = trajectory.system.acceleration(t, inner, *trajectory.system.evolving(inner))
+    offset, velocity = state.position - point, state.velocity
+    bend = jnp.stack([jnp.asarray(a, dtype=t.dtype) for a in pull])
+    s = low + (high - low) * _samples(_ON_ONE_ARC, t.dtype)[:, None]
+    away = jnp.sum(frozen(offset[None] + velocity[None] * s + 0.5 * bend[None] * s * s) ** 2, axis=-1)
+    nearest = jnp.argmin(jnp.where(jnp.isnan(away), jnp.inf, away))
+    s = s[nearest, 0]
+    for _ in range(_NEWTON_STEPS):
+        s = frozen(jnp.clip(s - _newton(offset, velocity, bend, s), low, high))
+    inside = (s > low) & (s < high)
+    s = jnp.where(inside, s - _newton(offset, velocity, bend, s), s)
+    return offset + velocity * s + 0.5 * bend * s * s, frozen(t + s)
+
+
+def _samples(n: int, dtype: Any) -> Any:
+    return jnp.linspace(0.0, 1.0, n, dtype=dtype)
+
+
+def _bracket(still: Trajectory, point: Any, start: Any, everywhere: bool) -> tuple[Any, Any, Any]:
+    """Times before and after the closest approach, and between them, by sampling ever finer."""
+    start = jnp.where(jnp.isfinite(start), start, still.t0)
+    samples = _samples(_ON_ALL_ARCS if everywhere else _ON_ONE_ARC, start.dtype)
+    last = samples.size - 1
+
+    def refined(_, bracket):
+        low, high, _ = bracket
+        times = low + (high - low) * samples
+        away = jnp.sum((still.at(times).position - point[None]) ** 2, axis=-1)
+        nearest = jnp.argmin(jnp.where(jnp.isnan(away), jnp.inf, away))
+        return times[jnp.maximum(nearest - 1, 0)], times[jnp.minimum(nearest + 1, last)], times[nearest]
+
+    return lax.fori_loop(0, _ROUNDS, refined, (start, still.t1, start))
+
+
+def _newton(offset: Any, velocity: Any, bend: Any, s: Any) -> Any:
+    """Newton's step for the zero of d/ds |offset + velocity s + bend s^2 / 2|^2 / 2."""
+    x, v = offset + velocity * s + 0.5 * bend * s * s, velocity + bend * s
+    speed = jnp.sum(v * v)
+    curvature = speed + jnp.sum(x * bend)
+    # Where the distance is not convex, the step of Gauss and Newton still goes downhill.
+    curvature = jnp.where(curvature > 0, curvature, speed)
+    usable = curvature > 0
+    return jnp.where(usable, jnp.sum(x * v) / jnp.where(usable, curvature, 1.0), 0.0)

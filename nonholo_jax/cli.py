@@ -1,0 +1,356 @@
+"""The command line: `nonholo VERB SCENE.toml`. Only this file touches JAX's configuration."""
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+DONE, BAD_INPUT, FAILED = 0, 2, 3
+_UNITS = {"position": "m", "velocity": "m/s", "spin": "rad/s", "gravity": "m/s^2", "point": "m", "center": "m",
+          "radius": "m", "half_size": "m", "mass": "kg", "wind": "m/s", "density": "kg/m^3"}  # fmt: skip
+
+
+class _BadInput(Exception):
+    """Something that the user can put right; the message is one line."""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise _BadInput(f"{message}; see nonholo --help")
+
+
+class _Answer(NamedTuple):
+    """What a verb found: for machines, for people, and for the picture."""
+
+    report: dict[str, Any]
+    text: list[str]
+    trajectory: Any
+    drawing: dict[str, Any]
+    failure: str | None
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command line.
+
+    **Arguments:** `argv`, the words behind `nonholo`; `None` for those of the process.
+
+    Returns the exit code: 0 done, 2 bad input (one line on standard error), 3 the computation failed.
+
+    ```python
+    from nonholo_jax.cli import main
+    main(["simulate", "no_such_file.toml"])
+    ```
+    """
+    try:
+        options = _parser().parse_args(argv)
+        return _run(options, from_start=argv is None)
+    except _BadInput as error:
+        print(f"nonholo: {' '.join(str(error).split())}", file=sys.stderr)
+        return BAD_INPUT
+    except BrokenPipeError:  # the reader of a pipe has gone; nothing may be written any more, not even at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except SystemExit as end:  # --help
+        return int(end.code or DONE)
+
+
+def _parser() -> argparse.ArgumentParser:
+    what = "Rough balls that fly and bounce: simulate a throw, or design one."
+    codes = "Exit code: 0 done, 2 bad input, 3 the computation failed."
+    parser = _Parser("nonholo", description=what, epilog=codes, allow_abbrev=False)
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    for verb, purpose in (
+        ("simulate", "simulate the throw of a scene file"),
+        ("design", "find the throw that reaches the goal of a scene file"),
+    ):
+        each = verbs.add_parser(verb, help=purpose, description=purpose.capitalize() + ".", allow_abbrev=False)
+        each.add_argument("scene", metavar="SCENE.toml", help="scene file; see experiments/scenes for examples")
+        each.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
+        each.add_argument("--out", metavar="DIR", help="folder for trajectory.png (default: nonholo-out/SCENE)")
+        each.add_argument("--float32", action="store_true", help="compute in float32 instead of float64")
+        each.add_argument("--no-plot", action="store_true", help="draw no picture")
+    return parser
+
+
+def _run(options: argparse.Namespace, from_start: bool) -> int:
+    began = time.perf_counter()
+    with _precision(options.float32):
+        from .scene_file import SceneError, load_scene
+
+        importing = _seconds_since_start() if from_start else time.perf_counter() - began
+        try:
+            file = load_scene(options.scene)
+        except SceneError as error:
+            raise _BadInput(str(error)) from None
+        for table, example in (("simulate", "t1 = 2.0"), ("design", 'free = ["spin.y"] and a goal')):
+            if table in ("simulate", options.verb) and getattr(file, table) is None:
+                what = f"`{table}` must be given for nonholo {options.verb}, but got nothing"
+                raise _BadInput(f"{options.scene}: {what}; add [{table}] with {example}")
+        folder = None if options.no_plot else _writable(options.out, options.scene)
+        clock = _CompileClock()
+        try:
+            answer = {"simulate": _simulate, "design": _design}[options.verb](file)
+        except ValueError as error:  # arguments that only the computation itself can judge
+            if not str(error).startswith("Argument "):
+                raise  # a fault of ours
+            raise _BadInput(f"{options.scene}: {error}") from None
+        seconds = {"import": importing, **clock.split()}
+        picture = None
+        if folder is not None:
+            began = time.perf_counter()
+            picture = _draw(file.scene, answer, folder / "trajectory.png")
+            seconds["plot"] = time.perf_counter() - began
+        _show(options, answer, seconds, picture)
+    if answer.failure is not None:
+        print(f"nonholo: {options.scene}: {' '.join(answer.failure.split())}", file=sys.stderr)
+        return FAILED
+    return DONE
+
+
+@contextlib.contextmanager
+def _precision(single: bool) -> Iterator[None]:
+    """Compute in float64 or float32, and leave JAX as it was."""
+    import jax
+
+    before = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    jax.config.update("jax_enable_x64", not single)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_x64", before)
+
+
+def _seconds_since_start() -> float:
+    """Wall seconds since the process began where the system tells (Linux), else its CPU seconds."""
+    try:
+        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+        elapsed = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError, AttributeError):
+        return time.process_time()
+    return elapsed if elapsed > 0 else time.process_time()  # a container may count from its own start
+
+
+class _CompileClock:
+    """Splits the wall time since it was made into compilation and the rest. JAX reports every trace, lowering and
+    compilation when it ends; they nest, so that what counts is the union of their intervals."""
+
+    _listening: "list[_CompileClock]" = []
+
+    def __init__(self):
+        import jax.monitoring
+
+        self.intervals: list[tuple[float, float]] = []
+        if not _CompileClock._listening:  # JAX has no public way to stop listening in every version: register once
+            jax.monitoring.register_event_duration_secs_listener(_CompileClock._heard)
+        _CompileClock._listening[:] = [self]
+        self.began = time.perf_counter()
+
+    @staticmethod
+    def _heard(event: str, duration_secs: float, **details: Any) -> None:
+        if event.startswith("/jax/core/compile/"):
+            now = time.perf_counter()
+            _CompileClock._listening[-1].intervals.append((now - duration_secs, now))
+
+    def split(self) -> dict[str, float]:
+        total = time.perf_counter() - self.began
+        compiling, end = 0.0, self.began
+        for low, high in sorted(self.intervals):
+            compiling += max(high - max(low, end), 0.0)
+            end = max(end, high)
+        return {"compile": compiling, "run": total - compiling}
+
+
+def _writable(out: str | None, scene: str) -> Path:
+    """The folder of the picture, made if need be."""
+    folder = Path("nonholo-out") / Path(scene).stem if out is None else Path(out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(13, "Permission denied")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise _BadInput(
+            f"argument --out must be a folder that can be written, but got {str(folder)!r} ({reason}); choose "
+            "another, or --no-plot"
+        ) from None
+    return folder
+
+
+def _draw(scene: Any, answer: _Answer, path: Path) -> str | None:
+    """Write the picture; `None` where there is nothing to draw, which the answer then says."""
+    from .plot import plot_trajectory
+
+    try:
+        plot_trajectory(scene, answer.trajectory, path=path, **answer.drawing)
+    except ValueError as error:
+        answer.text.append(f"  no picture: {error}")
+        return None
+    except OSError as error:
+        what = f"argument --out must be a folder with room for {str(path)!r}, but got {error.strerror or error}"
+        raise _BadInput(f"{what}; choose another, or --no-plot") from None
+    return str(path)
+
+
+# The verbs
+
+
+def _simulate(file: Any) -> _Answer:
+    import jax
+
+    from ._simulate import simulate
+    from ._types import is_failure, result_message, result_name
+
+    trajectory = simulate(file.scene, file.throw, **file.simulate.arguments, throw=False)
+    jax.block_until_ready(trajectory.t1)
+    result = result_name(trajectory.result)
+    report = {"throw": _state(file.throw), "result": result, **_motion(file.scene, trajectory)}
+    text = [f"{result}: {result_message(trajectory.result)}", "", *_table(report)]
+    failure = f"{result}: {result_message(trajectory.result)}" if bool(is_failure(trajectory.result)) else None
+    return _Answer(report, text, trajectory, {}, failure)
+
+
+def _state(state: Any) -> dict[str, list[float]]:
+    names = ("position", "velocity", "spin", "orientation")
+    fields = {name: getattr(state, name) for name in names}
+    return {name: [float(x) for x in value] for name, value in fields.items() if value is not None}
+
+
+def _energy(scene: Any, state: dict[str, list[float]]) -> float:
+    """Kinetic and potential energy in J, of a state as it is reported."""
+    ball, v, w = scene.ball, state["velocity"], state["spin"]
+    kinetic = (
+        0.5
+        * ball.mass
+        * (math.fsum(x * x for x in v) + ball.inertia_ratio * ball.radius**2 * math.fsum(x * x for x in w))
+    )
+    return float(kinetic - ball.mass * math.fsum(g * x for g, x in zip(scene.gravity, state["position"], strict=True)))
+
+
+def _motion(scene: Any, trajectory: Any) -> dict[str, Any]:
+    """The part of a report that every verb has."""
+    import jax
+    import numpy as np
+
+    log = jax.tree.map(np.asarray, trajectory.impacts)
+    impacts = []
+    for i in range(min(int(trajectory.n_impacts), len(log.time))):
+        before, after = (jax.tree.map(lambda x, i=i: x[i], each) for each in (log.before, log.after))
+        impacts.append(
+            {
+                "time": float(log.time[i]),
+                "surface": scene.names[int(log.surface[i])],
+                "point": [float(x) for x in log.point[i]],
+                "normal": [float(x) for x in log.normal[i]],
+                "before": _state(before),
+                "after": _state(after),
+            }
+        )
+    final, initial = _state(trajectory.final), _state(trajectory.initial)
+    return {
+        "itinerary": [impact["surface"] for impact in impacts],
+        "impacts": impacts,
+        "final": final,
+        "time": float(trajectory.t1),
+        "energy": {"initial": _energy(scene, initial), "final": _energy(scene, final)},
+    }
+
+
+def _design(file: Any) -> _Answer:
+    import jax
+
+    from ._design import design
+    from ._types import result_name
+
+    answer = design(file.scene, file.throw, **file.design.arguments, **file.simulate.arguments)
+    jax.block_until_ready(answer.miss)
+    values = [float(x) for x in answer.values]
+    reached = int((answer.starts.met & (answer.starts.miss <= answer.tolerance)).sum())
+    starts = answer.report()
+    report = {
+        "throw": _state(answer.state),
+        "found": dict(zip(answer.names, values, strict=True)),
+        "miss": float(answer.miss),
+        "loss": float(answer.loss),
+        "converged": answer.converged,
+        "evaluations": answer.evaluations,
+        "starts": {"count": len(starts), "reached": reached, "report": starts},
+        "result": result_name(answer.trajectory.result),
+        **_motion(answer.scene, answer.trajectory),
+    }
+    head = "found" if answer.converged else "not found; the closest miss is"
+    text = [f"{head}, by {len(starts)} starts and {answer.evaluations} trajectories:", ""]
+    width = max(len(name.removeprefix("throw.")) for name in answer.names)
+    text += [f"  {name.removeprefix('throw.'):<{width}} = {x!r} {_unit(name)}".rstrip()
+             for name, x in report["found"].items()]  # fmt: skip
+    text += [f"  miss {answer.miss:.3g} m, {reached} of {len(starts)} starts reached the goal", "", *_table(report)]
+    failure = None
+    if not answer.converged:
+        text += ["", "what each start did:", *(f"  {line}" for line in starts)]
+        asked = " after " + ", ".join(file.design.itinerary) if file.design.itinerary else ""
+        failure = (
+            f"no throw within `bounds` reached the goal{asked}: the best of {len(starts)} starts missed by "
+            f"{answer.miss:.3g} m; widen `design.bounds`, free more, raise `n_starts`, or change the itinerary"
+        )
+    goal = file.design.goal
+    hand = goal.point if type(goal).__name__ == "ReturnTo" else None
+    return _Answer(report, text, answer.trajectory, {"hand": hand}, failure)
+
+
+# Printing
+
+
+def _unit(name: str) -> str:
+    """The SI unit of a number by its name in the grammar of scene files."""
+    parts = [part for part in name.split(".") if part not in ("w", "x", "y", "z")]
+    return _UNITS.get(parts[-1], "")
+
+
+def _triple(vector: list[float]) -> str:
+    return " ".join(f"{0.0 if abs(x) < 5e-5 else x:9.4f}" for x in vector)
+
+
+def _table(report: dict[str, Any]) -> list[str]:
+    """The throw, every impact and the end, one aligned line each."""
+    impacts = report["impacts"]
+    width = max([len("surface"), *(len(impact["surface"]) for impact in impacts)])
+    lines = [
+        f"  {'time':>8}  {'':{width}}  {'position':^29}  {'velocity after':^29}  {'spin after':^29}",
+        f"  {'s':>8}  {'surface':{width}}  {'m':^29}  {'m/s':^29}  {'rad/s':^29}",
+    ]
+    rows = [(None, "(throw)", report["throw"])]
+    rows += [(impact["time"], impact["surface"], impact["after"]) for impact in impacts]
+    rows.append((report["time"], "(end)", report["final"]))
+    for moment, label, state in rows:
+        clock = "" if moment is None else f"{moment:.5f}"
+        vectors = "  ".join(_triple(state[name]) for name in ("position", "velocity", "spin"))
+        lines.append(f"  {clock:>8}  {label:{width}}  {vectors}")
+    energy = report["energy"]
+    lines += ["", f"  itinerary: {', '.join(report['itinerary']) or 'no impact'}"]
+    return [*lines, f"  energy: {energy['initial']:.6g} J at the throw, {energy['final']:.6g} J at the end"]
+
+
+def _finite(value: Any) -> Any:
+    """The same tree with null for what JSON has no word for."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _show(options: argparse.Namespace, answer: _Answer, seconds: dict[str, float], picture: str | None) -> None:
+    if options.json:
+        head = {"verb": options.verb, "scene": options.scene, "dtype": "float32" if options.float32 else "float64"}
+        whole = head | answer.report | {"seconds": seconds, "picture": picture}
+        print(json.dumps(_finite(whole), allow_nan=False), flush=True)
+        return
+    print(f"{options.scene}: " + "\n".join(answer.text))
+    if picture is not None:
+        print(f"  picture: {picture}")
+    print("  seconds: " + ", ".join(f"{name} {value:.2f}" for name, value in seconds.items()), flush=True)
