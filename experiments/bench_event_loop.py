@@ -22,7 +22,7 @@ from nonholo_jax import Air, Ball, BallState, Integrated, Plane, Rough, Scene, s
 
 jax.config.update("jax_enable_x64", True)
 
-T1, GRAVITY, CEILING, MAX_BOUNCES = 1.5, -9.81, 1.5, 12
+T1, CEILING, MAX_BOUNCES = 1.5, 1.0, 16
 BALL = Ball(radius=0.025, mass=0.046)
 LAW = Rough(restitution=0.9, tangential=0.5)
 SCENE = Scene(
@@ -37,8 +37,8 @@ SCENE = Scene(
 
 def throws(n: int) -> BallState:
     keys = jax.random.split(jax.random.key(0), 3)
-    position = jnp.array([0.0, 0.0, 0.75]) + jax.random.uniform(keys[0], (n, 3), minval=-0.3, maxval=0.3)
-    velocity = jax.random.uniform(keys[1], (n, 3), minval=-3.0, maxval=3.0)
+    position = jnp.array([0.0, 0.0, 0.5]) + jax.random.uniform(keys[0], (n, 3), minval=-0.3, maxval=0.3)
+    velocity = jax.random.uniform(keys[1], (n, 3), minval=-6.0, maxval=6.0)
     return BallState(position, velocity, 50.0 * jax.random.normal(keys[2], (n, 3)))
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool
 from ._polynomial import Polynomial, Window, derivative, evaluate, recentred
 from ._system import AbstractSystem, rounding
 from ._types import Index, Number, Scalar
-from ._vector import frozen, norm, select, slope
+from ._vector import frozen, norm, select, shared, slope
 
 
 class Arc(eqx.Module):
@@ -68,8 +68,10 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, s: Any, touching:
         bends = [evaluate(derivative(derivative(p)), 0.0) for p in coefficients]
         speed = norm(tangent) + jnp.sqrt(norm(bends) * reach)
         width = jnp.where(speed * left > 2.0 * reach, 2.0 * reach / jnp.where(speed > 0, speed, 1.0), left)
-    m = jnp.asarray(system.bend(contact, arc.time, Window(coefficients, width)), dtype=value.dtype)
-
+    bend = system.bend(contact, arc.time, Window(coefficients, width))
+    value, rate, m, most, width = shared(
+        [value, rate, jnp.asarray(bend.low, value.dtype), jnp.asarray(bend.high, value.dtype), width], s
+    )
     # A contact that has just been left has a gap of exactly zero that does not close; rounding may not say otherwise.
     left_behind = touching & (s == 0)
     value = jnp.where(left_behind, 0.0, jnp.maximum(value, 0.0))
@@ -81,9 +83,12 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, s: Any, touching:
     zero = jnp.where(rate < 0, falling, rising)
     if exact:
         return _Step(zero, zero <= left)
-    hit = (value <= tolerance) & ((rate < 0) | ((rate == 0) & (m < 0)))
+    # One Newton step from here leaves an error of bend (value / rate)^2 / 2: where that is rounding, the zero is found.
+    sharpest = jnp.maximum(jnp.abs(m), jnp.abs(most))
+    clear = (rate < 0) & (sharpest * value * value <= tolerance * rate * rate) & (value <= -rate * width)
+    near = (value <= tolerance) & ((rate < 0) | ((rate == 0) & (m < 0)))
     last = jnp.where(rate < 0, jnp.minimum(value / _nonzero(-rate), left), 0.0)
-    return _Step(jnp.where(hit, last, jnp.minimum(zero, width)), hit)
+    return _Step(jnp.where(near | clear, last, jnp.minimum(zero, width)), near | clear)
 
 
 def _nonzero(x: Any) -> Any:
@@ -130,8 +135,8 @@ def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meet
     columns = []
     for i in range(system.n_contacts):
         value, rate = slope(lambda x, i=i: system.level(i, arc.time, x), q, tangent)
-        columns.append((value, rate, system.bend(i, arc.time, here), rounding(system, i, q)))
-    value, rate, bend, tolerance = (select(contact, column) for column in zip(*columns, strict=True))
+        columns.append((value, rate, system.bend(i, arc.time, here).low, rounding(system, i, q)))
+    value, rate, bend, tolerance = shared([select(contact, column) for column in zip(*columns, strict=True)], s)
     return Meeting(value, rate, (bend < 0) & (rate * rate <= -2.0 * bend * tolerance))  # pyright: ignore
 
 

@@ -283,7 +283,7 @@ def _starts(problem: _Problem, chart: _Chart, first: Any, n_starts: int, key: An
     spread, flat = jax.random.split(key)
     normal = jax.random.normal(spread, shape, first.dtype)
     uniform = jax.random.uniform(flat, shape, first.dtype, minval=-1.0, maxval=1.0)
-    u = jnp.concatenate([chart.coordinate(first)[None], jnp.where(bounded, jnp.arcsin(uniform), normal)])
+    u = jnp.concatenate([chart.coordinate(first)[None], jnp.where(bounded[None], jnp.arcsin(uniform), normal)])
     miss = _screen(problem, chart, u)
     order = jnp.argsort(jnp.where(jnp.arange(u.shape[0]) == 0, -1.0, miss))  # the first guess always takes part
     return u[order[:n_starts]]
@@ -330,7 +330,7 @@ def _descend(problem: _Problem, chart: _Chart, initial: Any, solver: Any, max_st
 def _best(starts: Starts, chart: _Chart, first: Any, tolerance: float) -> int:
     """Of the starts that reached the goal the one nearest to the first guess; else the closest miss."""
     reached = starts.met & (starts.miss <= tolerance)
-    distance = jnp.sum(((starts.found - first) / chart.scale) ** 2, axis=-1)
+    distance = jnp.sum(((starts.found - first[None]) / chart.scale[None]) ** 2, axis=-1)
     if bool(jnp.any(reached)):
         # Several starts end at one answer up to rounding: take the most exact of those.
         nearest = jnp.min(jnp.where(reached, distance, jnp.inf))

@@ -119,6 +119,10 @@ def _shared(state: Any, finite: Any) -> Any:
     return jax.tree.unflatten(treedef, shared(leaves, finite))
 
 
+def _shared_flags(flags: tuple, finite: Any) -> list:
+    return [flag > 0.5 for flag in shared([flag.astype(finite.dtype) for flag in flags], finite)]
+
+
 def _keep(condition: Any, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
@@ -158,8 +162,8 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     arc = piece.arc
     kept, control = motion.judge(c.control, size, piece.trial)
     found = search(system, arc, c.s, c.touching, motion.safe_steps)
-    found = lax.optimization_barrier(found)
-    ended = kept & found.finished
+    kept, finished = _shared_flags((kept, found.finished), c.since)
+    ended = kept & finished
     crossed = ended & (found.contact >= 0)
     through = ended & ~crossed
     s, resting = jnp.where(through, arc.length, found.s), jnp.asarray(False)
@@ -179,6 +183,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     full = c.n_impacts >= max_impacts
     stuck = n_at_once > _MOST_IMPACTS_AT_ONCE
     stopped = crossed & (resting | full | stuck)
+    stopped, crossed = _shared_flags((stopped, crossed), c.since)
     struck = crossed & ~stopped
     if system.n_contacts > 0:
         after = _arrays(system.impact(found.contact, time, arrived), t1.dtype)
@@ -198,6 +203,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     result = RESULTS.where(crossed & stuck, RESULTS.corner, result)
     result = RESULTS.where(crossed & resting, RESULTS.sustained_contact, result)
     broken = ended & ~jnp.isfinite(time + sum(arrived_leaf.sum() for arrived_leaf in jax.tree.leaves(arrived)))
+    (broken,) = _shared_flags((broken,), c.since)
     result = RESULTS.where(broken, RESULTS.invalid_state, result)
     exhausted = (c.n_turns + 1 >= motion.max_turns(max_impacts)) & ~(reached | stopped | broken)
     result = RESULTS.where(exhausted, RESULTS.step_limit, result)
@@ -295,7 +301,7 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         needed = eqxi.unvmap_any(steps[0][0] < known.n_arcs)
         return lax.cond(needed, run, lambda carry: carry, carry), None
 
-    values = jnp.where(jnp.isnan(known.log.values), jnp.nan, 0.0)  # rows that are not used stay NaN
+    values = jnp.where(jnp.isnan(known.log.values), known.log.values, 0.0)  # rows that are not used stay NaN
     rows = path.contact.shape[0]
     size = min(_CHUNK, rows)
     padding = -rows % size

@@ -170,13 +170,13 @@ def _unrolled_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -> P
         stages.append(shared([h * x for x in (*z[n:], *a)], h))
     z0 = (*q, *v)
     columns = [[k[j] for k in stages] for j in range(2 * n)]
-    steps = [_combination(tableau.b_sol, column) for column in columns]
+    steps = shared([_combination(tableau.b_sol, column) for column in columns], h)
     z1 = tuple(plus(x, step) for x, step in zip(z0, steps, strict=True))
     error = tuple(_combination(tableau.b_error, column) for column in columns)
     weights = interpolation_weights(solver)
     polynomials = []
     for x, step, column in zip(z0, steps, columns, strict=True):
-        inner = [_combination(row, column) for row in weights]
+        inner = shared([_combination(row, column) for row in weights], h)
         # The last coefficient makes the polynomial end where the step ends, to rounding.
         polynomials.append((x, *inner, plus(step, times(-1.0, total(inner)))))
     one = jnp.ones_like(h)

@@ -25,6 +25,7 @@ from ._vector import (
     scale,
     select,
     select_vector,
+    shared,
     subtract,
     times,
 )
@@ -117,11 +118,12 @@ class Scene(AbstractSystem):
         closing = dot(n, state.velocity)
         contact_velocity = subtract(state.velocity, scale(ball.radius, cross(state.spin, n)))
         slip = subtract(contact_velocity, scale(closing, n))
+        closing, *slip = shared([closing, *slip], time)
         sizes = (ball.inertia_ratio, abs(closing), dot(slip, slip))
         s = select(contact, [surface.law.slip_factor(*sizes) for surface in self.surfaces])
         kick = add(scale(times(plus(1.0, e_n), closing), n), scale(s, slip))
         twist = times(s, ratio(1.0, times(ball.inertia_ratio, ball.radius)))
-        spin = add(state.spin, scale(twist, cross(n, slip)))
+        spin = add(state.spin, scale(twist, cross(n, tuple(slip))))
         return Flight(x, subtract(state.velocity, kick), spin, state.orientation)
 
     def level(self, contact, time, q):

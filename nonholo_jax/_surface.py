@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from ._law import AbstractContactLaw
 from ._polynomial import Interval, Window, evaluate, product, square
@@ -60,8 +59,8 @@ class AbstractSurface(eqx.Module):
         """The length over which `bend` is tight, or `None` where it is so everywhere."""
 
     @abstractmethod
-    def bend(self, window: Window, t: Number, radius: Number) -> Number:
-        """A lower bound of the second derivative of the level along the path in the window."""
+    def bend(self, window: Window, t: Number, radius: Number) -> Interval:
+        """Bounds of the second derivative of the level along the path in the window."""
 
     @abstractmethod
     def extent(self) -> Number:
@@ -153,7 +152,7 @@ class Plane(AbstractSurface):
         return None
 
     def bend(self, window, t, radius):
-        return window.along(unit(components(self.facing)), (0.0, 0.0, 0.0)).bend.low
+        return window.along(unit(components(self.facing)), (0.0, 0.0, 0.0)).bend
 
     def extent(self):
         return norm(components(self.point))
@@ -179,19 +178,21 @@ def _box_level(y: Vector3, half: Vector3, radius: Number) -> Number:
     return ratio(plus(dot(beyond, beyond), times(-1.0, times(radius, radius))), times(2.0, radius))
 
 
-def _box_bend(window: Window, axes: tuple, center: Vector3, half: Vector3, radius: Number) -> Number:
-    """sum_i min(0, min(v_i^2 + e_i a_i)) / r; a clipped square bends by v^2 + e a where e > 0 and by 0 elsewhere."""
-    terms = []
+def _box_bend(window: Window, axes: tuple, center: Vector3, half: Vector3, radius: Number) -> Interval:
+    """The sum of the clipped squares' second derivatives, each v^2 + e a where e > 0 and 0 elsewhere, over r."""
+    lows, highs = [], []
     for axis, h in zip(axes, half, strict=True):
         value, rate, bend = window.along(axis, center)
         farthest = maximum(plus(maximum(value.high, times(-1.0, value.low)), times(-1.0, h)), 0.0)
-        # e a is bounded for either sign of the coordinate by -|e| max(|a|); on one side only, by that side's sign.
+        # The excess e grows with the coordinate on the right of the box and against it on the left.
         right, left = value.low > 0, value.high < 0
-        pull = maximum(abs(bend.low), abs(bend.high))
-        pull = where_number(right, maximum(times(-1.0, bend.low), 0.0), pull)
-        pull = where_number(left, maximum(bend.high, 0.0), pull)
-        terms.append(minimum(plus(square(rate).low, times(-1.0, times(farthest, pull))), 0.0))
-    return ratio(total(terms), radius)
+        either = maximum(abs(bend.low), abs(bend.high))
+        away = where_number(right, bend.high, where_number(left, times(-1.0, bend.low), either))
+        back = where_number(right, times(-1.0, bend.low), where_number(left, bend.high, either))
+        squares = square(rate)
+        lows.append(minimum(plus(squares.low, times(-1.0, times(farthest, maximum(back, 0.0)))), 0.0))
+        highs.append(where_number(farthest > 0, plus(squares.high, times(farthest, maximum(away, 0.0))), 0.0))
+    return Interval(ratio(total(lows), radius), ratio(total(highs), radius))
 
 
 def _box_direction(y: Vector3, half: Vector3, axes: tuple) -> Vector3:
@@ -339,13 +340,11 @@ def _round_level(y: tuple, reach: Number, inside: bool) -> Number:
     return times(-1.0, outside) if inside else outside
 
 
-def _round_bend(window: Window, axes: tuple, origin: Vector3, reach: Number, inside: bool) -> Number:
+def _round_bend(window: Window, axes: tuple, origin: Vector3, reach: Number, inside: bool) -> Interval:
     tracks = [window.along(axis, origin) for axis in axes]
-    rates = [square(track.rate) for track in tracks]
-    pulls = [product(track.value, track.bend) for track in tracks]
-    if inside:
-        return times(-1.0, ratio(total([term.high for term in (*rates, *pulls)]), reach))
-    return ratio(total([term.low for term in (*rates, *pulls)]), reach)
+    terms = [*[square(track.rate) for track in tracks], *[product(track.value, track.bend) for track in tracks]]
+    low, high = (ratio(total([getattr(term, end) for term in terms]), reach) for end in ("low", "high"))
+    return Interval(times(-1.0, high), times(-1.0, low)) if inside else Interval(low, high)
 
 
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -527,12 +526,13 @@ class Implicit(AbstractSurface):
         tracks = [window.track(p) for p in window.coefficients]
         fastest = norm([maximum(abs(track.rate.low), abs(track.rate.high)) for track in tracks])
         hardest = norm([maximum(abs(track.bend.low), abs(track.bend.high)) for track in tracks])
-        steepest = norm(self._gradient(start, t))
-        along = total([product(_point(g), track.bend).low
-                       for g, track in zip(self._gradient(start, t), tracks, strict=True)])  # fmt: skip
-        turned = times(self.curvature, times(fastest, window.width))  # how far the gradient can turn in the window
-        straight = maximum(along, times(-1.0, times(steepest, hardest)))
-        return straight - times(self.curvature, fastest * fastest) - times(turned, hardest)
+        along = [
+            product(Interval(g, g), track.bend) for g, track in zip(self._gradient(start, t), tracks, strict=True)
+        ]
+        # v . H v, and what the gradient can turn by within the window, times the acceleration.
+        turned = times(times(self.curvature, times(fastest, window.width)), hardest)
+        margin = plus(times(self.curvature, fastest * fastest), turned)
+        return Interval(total([x.low for x in along]) - margin, total([x.high for x in along]) + margin)
 
     def _sampled_bend(self, window, t):
         def along(s):
@@ -544,7 +544,7 @@ class Implicit(AbstractSurface):
         low, high = samples[0], samples[0]
         for sample in samples[1:]:
             low, high = minimum(low, sample), maximum(high, sample)
-        return low - (high - low)
+        return Interval(low - (high - low), high + (high - low))
 
     def extent(self):
         return 0.0
@@ -553,12 +553,3 @@ class Implicit(AbstractSurface):
         if self.curvature is None:
             return []
         return [(self.curvature >= 0, f"`curvature` must not be negative, but got {self.curvature}")]
-
-
-def _point(x: Number) -> Interval:
-    return Interval(x, x)
-
-
-def surface_normals(surfaces: tuple, x: Vector, t: Scalar) -> Float[Array, "surfaces 3"]:
-    """The normals of all surfaces at one point."""
-    return jnp.stack([surface.normal(x, t) for surface in surfaces])

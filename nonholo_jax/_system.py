@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ._polynomial import Window
+from ._polynomial import Interval, Window
 from ._types import Index, Number, Scalar
 from ._vector import is_constant, plus, times, total
 
@@ -49,8 +49,8 @@ class AbstractSystem(eqx.Module):
         """A length over which `bend` is worth asking for; `None` if it is as good over the whole arc."""
 
     @abstractmethod
-    def bend(self, contact: int, time: Scalar, window: Window) -> Number:
-        """A lower bound of the second derivative of the level along the window."""
+    def bend(self, contact: int, time: Scalar, window: Window) -> Interval:
+        """Bounds of the second derivative of the level along the window."""
 
     @abstractmethod
     def is_bounded(self, contact: int) -> bool:

@@ -153,7 +153,7 @@ MALFORMED = {
         "exchange"),
     "bounds of what is not free": ('"spin.y" = [', '"spin.x" = [', "`design.bounds.'spin.x'`", "'spin.x'",
         "`design.free`"),
-    "bounds of nothing": ('"spin.y" = [', '"spam" = [', "`design.bounds`", "'spam'", "did you mean"),
+    "bounds of nothing": ('"spin.y" = [', '"spam" = [', "`design.bounds`", "'spam'", "try"),
     "no starts": ("[design]", "[design]\nn_starts = 0", "`design.n_starts`", "0", "n_starts = 16"),
     "empty surface name": ("[surfaces.floor]", '[surfaces.""]', "`surfaces`", "''", "rename"),
     "dot in surface name": ("[surfaces.floor]", '[surfaces."a.b"]', "`surfaces`", "'a.b'", "rename"),

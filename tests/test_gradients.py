@@ -1,0 +1,357 @@
+"""Derivatives of a motion through its impacts, in both modes, of every law, surface and motion of the registry.
+
+With constant steps the derivative of `Integrated` is that of the discrete map, whatever the order of the solver, so
+that a solver of two stages, quick to compile, stands for all. Adaptive Tsit5 is tested on one surface.
+"""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import (
+    AIR,
+    BALL,
+    GRAVITY,
+    AnyLaw,
+    all_laws,
+    all_motions,
+    all_surfaces,
+    arrays,
+    lane,
+    named,
+    scene_of,
+    stacked,
+    states,
+    throws,
+)
+from jax.flatten_util import ravel_pytree
+
+from nonholo_jax import (
+    Ball,
+    BallState,
+    Box,
+    Exact,
+    Frictional,
+    Integrated,
+    Plane,
+    Rough,
+    Scene,
+    Smooth,
+    Sphere,
+    collide,
+    simulate,
+)
+
+T1, MAX_IMPACTS, PER_LAW = 0.5, 4, 3
+PLANE = all_surfaces[0]
+
+
+def all_numbers(case, state, dtype=np.float64):
+    """Every number that a motion depends on."""
+    return {
+        "state": {"position": state.position, "velocity": state.velocity, "spin": state.spin},
+        "ball": arrays(BALL, dtype),
+        "laws": {law.name: arrays(law.numbers, dtype) for law in all_laws},
+        "surface": arrays(case.numbers, dtype),
+        "gravity": jnp.asarray(GRAVITY, dtype),
+        "air": arrays(AIR, dtype),
+        "t1": jnp.asarray(T1, dtype),
+    }
+
+
+def move(case, motion, numbers, law, adjoint=None, with_air=False):
+    scene = scene_of(
+        case, law, ball=numbers["ball"], numbers=numbers["surface"], gravity=numbers["gravity"],
+        air=numbers["air"] if with_air else None,
+    )  # fmt: skip
+    options = {"max_impacts": MAX_IMPACTS, "motion": motion, "adjoint": adjoint, "throw": False}
+    return simulate(scene, BallState(**numbers["state"]), t1=numbers["t1"], **options)
+
+
+def outputs(trajectory):
+    """Final state, and time and place of the first impact."""
+    log = trajectory.impacts
+    return jnp.concatenate([stacked(trajectory.final), log.time[:1], log.point[0]])
+
+
+def one_motion(case, motion, adjoint=None):
+    """(numbers flattened, index of the law) -> outputs, and how to unflatten."""
+    air = not isinstance(motion, Exact)
+    example = all_numbers(case, lane(throws(case, jax.random.key(0), 1), 0))
+    unravel = ravel_pytree(example)[1]
+
+    def trajectory(flat, index):
+        numbers = unravel(flat)
+        law = AnyLaw(index, tuple(law.build(**numbers["laws"][law.name]) for law in all_laws))
+        return move(case, motion, numbers, law, adjoint, with_air=air)
+
+    return trajectory, unravel
+
+
+def batch_of(case, key, dtype=np.float64):
+    """Flattened numbers for a few throws at every law, and the indices of the laws."""
+    n = PER_LAW * len(all_laws)
+    throw = throws(case, key, n, flight=(0.15, 0.25), dtype=dtype)
+    flat = jnp.stack([ravel_pytree(all_numbers(case, lane(throw, i), dtype))[0] for i in range(n)])
+    return flat, jnp.repeat(jnp.arange(len(all_laws), dtype=jnp.int32), PER_LAW)
+
+
+def differences(function, flat, index, step):
+    """Central differences of fourth order, (lanes, outputs, numbers), and whether all points of them share their
+    number of impacts."""
+    steps = step * np.maximum(np.abs(np.asarray(flat)), 0.1)  # (lanes, numbers)
+    shifts = jnp.asarray(np.array([-2, -1, 1, 2])[:, None, None] * np.eye(flat.shape[1]))
+
+    @jax.jit
+    @jax.vmap
+    def around(x, h, i):
+        end = jax.vmap(jax.vmap(lambda d: function(x + d * h, i)))(shifts)
+        return jnp.einsum("s,spo->po", jnp.array([1, -8, 8, -1]) / 12, outputs_of(end)) / h[:, None], end.n_impacts
+
+    def outputs_of(end):
+        return jax.vmap(jax.vmap(outputs))(end)
+
+    slopes, counts = around(flat, jnp.asarray(steps), index)
+    counts = np.asarray(counts).reshape(len(flat), -1)
+    return np.asarray(slopes).transpose(0, 2, 1), np.all(counts == counts[:, :1], axis=1)
+
+
+def saltation(scene, trajectory, t1):
+    """flight(t1 - t) S flight(t) of a motion with one impact at t, with (Kong et al. 2023)
+    S = D_x R + (f+ - D_x R f-) D_x g / (D_x g f-), the impact R from the general projector of Lemma 1."""
+    surface, ball, law = scene.surfaces[0], scene.ball, scene.surfaces[0].law
+    g = jnp.asarray(scene.gravity)
+    before = stacked(lane(trajectory.impacts.before, 0))
+    metric = jnp.diag(jnp.stack([ball.mass] * 3 + [ball.inertia] * 3))
+
+    def reset(y):
+        n = surface.normal(y[:3], 0.0)
+        turn = jnp.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])  # n x
+        contact = jnp.concatenate([jnp.eye(3), ball.radius * turn], axis=1)  # v - r omega x n
+        tangent = (jnp.eye(3) - jnp.outer(n, n)) @ contact
+        normal = jnp.concatenate([n, jnp.zeros(3)])[None]
+        closing, slip = jnp.abs(n @ y[3:6]), tangent @ y[3:]
+        grip = ball.inertia_ratio / (1 + ball.inertia_ratio)
+        e_t = law.slip_factor(ball.inertia_ratio, closing, slip @ slip) / grip - 1
+        v = collide(y[3:], metric, normal, law.restitution)
+        return jnp.concatenate([y[:3], collide(v, metric, tangent, e_t)])
+
+    field = lambda y: jnp.concatenate([y[3:6], g, jnp.zeros(3)])  # noqa: E731
+    d_reset = jax.jacfwd(reset)(before)
+    f_minus, f_plus = field(before), field(reset(before))
+    d_gap = jnp.concatenate([surface.normal(before[:3], 0.0), jnp.zeros(6)])
+    jump = d_reset + jnp.outer(f_plus - d_reset @ f_minus, d_gap) / (d_gap @ f_minus)
+    flight = lambda t: jnp.eye(9) + t * jnp.eye(9, k=3) * jnp.repeat(jnp.array([1.0, 0, 0]), 3)[:, None]  # noqa: E731
+    t = trajectory.impacts.time[0]
+    return flight(t1 - t) @ jump @ flight(t)
+
+
+def relative(a, b):
+    """The largest difference, each row (one output) in units of its largest entry."""
+    size = np.maximum(np.max(np.abs(b), axis=-1, keepdims=True), 1e-3)
+    return np.max(np.nan_to_num(np.abs(a - b) / size, nan=np.inf))
+
+
+@pytest.mark.parametrize("motion", ["exact", "heun"])
+@pytest.mark.parametrize("case", **named(all_surfaces))
+def test_modes_agree_with_differences_and_saltation(case, motion, getkey):
+    function, unravel = one_motion(case, all_motions[motion])
+    flat, index = batch_of(case, getkey())
+    value = lambda x, i: outputs(function(x, i))  # noqa: E731
+    forward = np.asarray(jax.jit(jax.vmap(jax.jacfwd(value)))(flat, index))
+    reverse = np.asarray(jax.jit(jax.vmap(jax.jacrev(value)))(flat, index))
+    assert np.all(np.isfinite(forward))
+    assert relative(forward, reverse) < 1e-10
+    expected, same = differences(function, flat, index, 1e-4)
+    assert same.sum() > 0.8 * len(same)
+    assert relative(forward[same], expected[same]) < 1e-7
+    # Every number of the laws counts in some lane, and so do the others, but for the mass and the air in vacuum.
+    matters = unravel(jnp.asarray(np.abs(forward[..., :]).max(axis=(0, 1))))
+    unused = {"exact": {"mass", *AIR}, "heun": set()}[motion]
+    for group in ("ball", "surface", "air"):
+        assert all(np.any(x > 0) for name, x in matters[group].items() if name not in unused)
+    assert all(np.all(x > 0) for law in matters["laws"].values() for name, x in law.items() if name != "friction")
+    assert matters["laws"]["frictional_sliding"]["friction"] > 0
+    if motion == "exact":
+        check_saltation(case, function, unravel, flat, index, forward)
+
+
+def check_saltation(case, function, unravel, flat, index, jacobian):
+    def expected(x, i):
+        numbers = unravel(x)
+        law = AnyLaw(i, tuple(law.build(**numbers["laws"][law.name]) for law in all_laws))
+        scene = scene_of(case, law, ball=numbers["ball"], numbers=numbers["surface"], gravity=numbers["gravity"])
+        trajectory = function(x, i)
+        return saltation(scene, trajectory, numbers["t1"]), trajectory.n_impacts
+
+    matrices, counts = jax.jit(jax.vmap(expected))(flat, index)
+    once = np.asarray(counts) == 1
+    assert once.sum() >= len(all_laws)
+    places = unravel(jnp.arange(flat.shape[1], dtype=float))["state"]
+    columns = np.concatenate([np.asarray(places[name], int) for name in ("position", "velocity", "spin")])
+    assert relative(jacobian[once][:, :9][:, :, columns], np.asarray(matrices)[once]) < 1e-10
+
+
+def test_adaptive_steps_agree_with_differences(getkey):
+    """The derivative is that of the path taken: step sizes count as given, which is right to the tolerance."""
+    case = next(case for case in all_surfaces if case.name == "sphere_inside")
+    function, _ = one_motion(case, all_motions["tsit5"])
+    flat, index = batch_of(case, getkey())
+    value = lambda x, i: outputs(function(x, i))  # noqa: E731
+    forward = np.asarray(jax.jit(jax.vmap(jax.jacfwd(value)))(flat, index))
+    expected, same = differences(function, flat, index, 1e-3)
+    assert same.sum() > 0.8 * len(same)
+    assert relative(forward[same], expected[same]) < 1e-5
+
+
+def test_each_law_alone_agrees_with_the_choice_of_laws(getkey):
+    """One program per law, with what it knows at trace time, against the program that chooses lane by lane."""
+    function, unravel = one_motion(PLANE, Exact())
+    flat, index = batch_of(PLANE, getkey())
+    flat, index = flat[::PER_LAW], index[::PER_LAW]
+
+    @jax.jit
+    def alone(flat):
+        def value(x, law):
+            numbers = unravel(x)
+            return outputs(move(PLANE, Exact(), numbers, law.build(**numbers["laws"][law.name])))
+
+        return jnp.stack([jax.jacrev(value)(x, law) for x, law in zip(flat, all_laws, strict=True)])
+
+    chosen = jax.jit(jax.vmap(jax.jacrev(lambda x, i: outputs(function(x, i)))))(flat, index)
+    assert relative(np.asarray(alone(flat)), np.asarray(chosen)) < 1e-12
+
+
+# Other adjoints
+
+
+@pytest.mark.parametrize("motion", ["exact", "heun"])
+def test_adjoints_agree(motion, getkey):
+    case = next(case for case in all_surfaces if case.name == "sphere_inside")
+    flat, index = batch_of(case, getkey())
+    found = []
+    for adjoint, mode in [
+        (None, jax.jacrev),
+        (diffrax.ForwardMode(), jax.jacfwd),
+        (diffrax.RecursiveCheckpointAdjoint(), jax.jacrev),
+    ]:
+        function, _ = one_motion(case, all_motions[motion], adjoint)
+        jacobian = jax.jit(jax.vmap(mode(lambda x, i, f=function: outputs(f(x, i))[:9])))
+        found.append(np.asarray(jacobian(flat, index)))
+    assert relative(found[1], found[0]) < 1e-9
+    assert relative(found[2], found[0]) < 1e-9
+
+
+# Second derivatives
+
+
+@pytest.mark.parametrize("name", ["plane", "sphere_inside", "box"])
+def test_second_derivatives(name, getkey):
+    """jax.hessian of a component of the final position, against differences of its gradient."""
+    case = next(case for case in all_surfaces if case.name == name)
+    scene = scene_of(case, Rough(0.8))
+    throw = throws(case, getkey(), 4, flight=(0.15, 0.25))
+    weights = jnp.array([0.3, -0.5, 0.8])
+
+    def height(velocity, position, spin):
+        return (
+            weights
+            @ simulate(scene, BallState(position, velocity, spin), t1=T1, max_impacts=4, throw=False).final.position
+        )
+
+    rest = (throw.position, throw.spin)
+    hessian = np.asarray(jax.jit(jax.vmap(jax.hessian(height)))(throw.velocity, *rest))
+    gradient = jax.jit(jax.vmap(jax.grad(height)))
+    h = 1e-5
+    columns = [(gradient(throw.velocity + h * e, *rest) - gradient(throw.velocity - h * e, *rest)) / (2 * h)
+               for e in jnp.eye(3)]  # fmt: skip
+    expected = np.stack([np.asarray(column) for column in columns], axis=-1)
+    assert np.abs(hessian).max() > 1e-3
+    assert np.abs(hessian - expected).max() < 1e-6 * max(1.0, np.abs(expected).max())
+    assert np.abs(hessian - hessian.mT).max() < 1e-9 * np.abs(hessian).max()
+
+
+# No NaN
+
+
+def awkward_lanes(dtype):
+    """Lanes that end in every way: what it is, position, velocity, spin."""
+    r = 0.1
+    rows = {
+        "bounces": ([0, 0, 1.0], [0.5, 0, -1], [1, 2, 3]),
+        "finished_at_once_touching_and_leaving": ([0, 0, r], [0, 0, 3], [0, 0, 0]),
+        "touching_and_approaching": ([0, 0, r], [1, 0, -3], [0, 0, 0]),
+        "at_rest_on_the_floor": ([0, 0, r], [0, 0, 0], [0, 0, 0]),
+        "slides_on_the_floor": ([0, 0, r], [1, 0, 0], [0, 0, 0]),
+        "drops_without_slip_or_spin": ([0.5, 0.5, 0.5], [0, 0, 0], [0, 0, 0]),
+        "misses_everything": ([0, 0, 3.0], [0, 0, 9], [0, 0, 0]),
+        "grazes_the_sphere": ([1.0, 0, 3.0], [0, 0, 0], [0, 0, 0]),
+        "drops_on_the_top_of_the_sphere": ([2.0, 0, 1.7], [0, 0, 0], [0, 0, 0]),
+        "drops_on_an_edge_of_the_box": ([-1.5, 0, 1.2], [0, 0, 0], [0, 0, 0]),
+        "drops_on_a_corner_of_the_box": ([-1.5, -0.5, 1.2], [0, 0, 0], [0, 0, 0]),
+        "floor_and_box_together": ([-1.4, 0, r], [-1, 0, -1], [0, 0, 0]),
+        "bounces_without_end": ([0.5, 0.5, r + 1e-9], [0, 0, 0], [0, 0, 0]),
+        "starts_inside_the_sphere": ([2.0, 0, 1.0], [0, 0, 0], [0, 0, 0]),
+        "starts_at_the_centre_of_the_box": ([-2.0, 0, 0.5], [0, 0, 0], [0, 0, 0]),
+    }
+    return list(rows), states(*zip(*rows.values(), strict=True), dtype)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("motion", ["exact", "heun"])
+def test_no_nan_in_any_lane(motion, dtype):
+    names, throw = awkward_lanes(dtype)
+    cast = lambda x: jnp.asarray(x, dtype)  # noqa: E731
+    numbers = {"radius": cast(0.1), "e": cast(0.7), "t": cast(0.2), "f": cast(0.3), "size": cast([0.5, 0.5, 0.5])}
+
+    def end(numbers, state):
+        surfaces = {
+            "floor": Plane(cast([0, 0, 0]), (0, 0, 1), Frictional(numbers["e"], numbers["t"], numbers["f"])),
+            "ball": Sphere(cast([2.0, 0, 0.8]), cast(0.9), Rough(numbers["e"])),
+            "box": Box(cast([-2.0, 0, 0.5]), numbers["size"], Smooth(numbers["e"])),
+        }
+        air = None if motion == "exact" else AIR
+        scene = scene_of_surfaces(numbers["radius"], surfaces, air)
+        trajectory = simulate(scene, state, t1=0.6, max_impacts=6, motion=all_motions[motion], throw=False)
+        log = trajectory.impacts
+        time = jnp.where(log.surface >= 0, log.time, 0.0).sum()
+        return stacked(trajectory.final), time, trajectory.t1
+
+    value = jax.jit(jax.vmap(end, in_axes=(None, 0)))(numbers, throw)
+    fine = [np.all(np.isfinite(lane(value[0], i))) for i in range(len(names))]
+    assert all(fine), [name for name, ok in zip(names, fine, strict=True) if not ok]
+    for mode in (jax.jacfwd, jax.jacrev):
+        jacobian = jax.jit(jax.vmap(mode(end, argnums=(0, 1)), in_axes=(None, 0)))(numbers, throw)
+        for i, name in enumerate(names):
+            assert all(np.all(np.isfinite(leaf[i])) for leaf in jax.tree.leaves(jacobian)), (name, mode.__name__)
+
+
+def scene_of_surfaces(radius, surfaces, air):
+    scene = scene_of(PLANE, Rough(), air=air)
+    return Scene(Ball(radius, 0.7), surfaces, GRAVITY, scene.air)
+
+
+@pytest.mark.parametrize("motion", ["exact", "heun"])
+def test_single_precision_gradients(motion, getkey):
+    """float32 derivatives are float32, and those of float64 to its precision."""
+    motion = all_motions[motion]
+    throw = throws(PLANE, getkey(), 8, flight=(0.15, 0.25))
+
+    def jacobian(dtype):
+        def value(x):
+            numbers = all_numbers(PLANE, BallState(x[:3], x[3:6], x[6:]), dtype)
+            return stacked(move(PLANE, motion, numbers, Rough(jnp.asarray(0.8, dtype))).final)
+
+        return jax.jit(jax.vmap(jax.jacrev(value)))(stacked(throw).astype(dtype))
+
+    single, double = jacobian(np.float32), jacobian(np.float64)
+    assert single.dtype == np.float32 and double.dtype == np.float64
+    assert relative(np.asarray(single, float), np.asarray(double)) < 1e3 * np.finfo(np.float32).eps
+
+
+def test_motion_may_be_chosen_by_default():
+    """Air needs an integrator; without it the closed form is as good and cheaper."""
+    state = lane(throws(PLANE, jax.random.key(0), 1), 0)
+    assert isinstance(simulate(scene_of(PLANE, Rough()), state, t1=0.1).motion, Exact)
+    assert isinstance(simulate(scene_of(PLANE, Rough(), air=AIR), state, t1=0.1).motion, Integrated)
