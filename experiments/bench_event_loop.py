@@ -70,6 +70,7 @@ def restarted(tolerance: float):
             event=event,
             throw=False,
         )
+        assert solution.ts is not None and solution.ys is not None
         end, y = solution.ts[0], solution.ys[0]
         state = SCENE.unpacked(BallState(y[:3], y[3:], spin))
         hit = jnp.where(y[2] < 0.5 * CEILING, 0, 1)
@@ -111,7 +112,7 @@ def compiled(function, states) -> tuple[float, np.ndarray]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--throws", type=int, default=4096)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--json")

@@ -2,22 +2,20 @@
 
 from ._air import Air as Air
 from ._ball import Ball as Ball, BallState as BallState
+from ._box import Box as Box, Rectangle as Rectangle
 from ._design import Design as Design, design as design
 from ._goal import AbstractGoal as AbstractGoal, HitTarget as HitTarget, Land as Land, ReturnTo as ReturnTo
 from ._impact import collide as collide, projector as projector
 from ._law import AbstractContactLaw as AbstractContactLaw, Frictional as Frictional, Rough as Rough, Smooth as Smooth
 from ._motion import AbstractMotion as AbstractMotion, Exact as Exact
 from ._motion_integrated import Integrated as Integrated
+from ._round import Cylinder as Cylinder, Sphere as Sphere
 from ._scene import Scene as Scene
 from ._simulate import SimulationError as SimulationError, simulate as simulate, simulate_batch as simulate_batch
 from ._surface import (
     AbstractSurface as AbstractSurface,
-    Box as Box,
-    Cylinder as Cylinder,
     Implicit as Implicit,
     Plane as Plane,
-    Rectangle as Rectangle,
-    Sphere as Sphere,
 )
 from ._trajectory import ImpactLog as ImpactLog, Trajectory as Trajectory
 from ._types import KINDS as KINDS, RESULTS as RESULTS

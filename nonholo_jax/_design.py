@@ -63,12 +63,13 @@ class Design(eqx.Module):
         """One line for each start: where it began, what it found, and why it is no answer if it is none."""
         lines = []
         for i in range(self.starts.miss.shape[0]):
-            begun, ended = (
-                ", ".join(f"{name.removeprefix('throw.')} = {float(x):.6g}" for name, x in zip(self.names, xs, strict=True))
-                for xs in (self.starts.initial[i], self.starts.found[i])
-            )  # fmt: skip
+            begun, ended = (self._spelled(xs) for xs in (self.starts.initial[i], self.starts.found[i]))
             lines.append(f"from {begun} to {ended}: {self._verdict(i)}")
         return lines
+
+    def _spelled(self, values: Any) -> str:
+        pairs = zip(self.names, values, strict=True)
+        return ", ".join(f"{name.removeprefix('throw.')} = {float(x):.6g}" for name, x in pairs)
 
     def _verdict(self, i: int) -> str:
         each = jax.tree.map(lambda x: x[i], self.starts)

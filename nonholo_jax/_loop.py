@@ -185,10 +185,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     stopped = crossed & (resting | full | stuck)
     stopped, crossed = _shared_flags((stopped, crossed), c.since)
     struck = crossed & ~stopped
-    if system.n_contacts > 0:
-        after = _arrays(system.impact(found.contact, time, arrived), t1.dtype)
-    else:
-        after = arrived
+    after = _arrays(system.impact(found.contact, time, arrived), t1.dtype) if system.n_contacts > 0 else arrived
     row = pack_row(Row(time, since, arrived, after))
     log = Log(
         _write(c.log.values, c.n_impacts, struck & ~c.done, row),
@@ -240,7 +237,7 @@ def _tiny(system: AbstractSystem, arc: Any, s: Any) -> Any:
     return 64.0 * eps * frozen(norm(arc.position(s)))
 
 
-def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, path_rows: int, kind: str = "lax"):
+def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, path_rows: int, kind: Any = "lax"):
     """Run the loop; returns the outcome and the path. `kind` chooses how the loop itself may be differentiated."""
     carry = _start(system, motion, state, t0, t1, log_rows, path_rows)
     turn = lambda c: _turn(c, system, motion, t1, max_impacts)  # noqa: E731
@@ -329,7 +326,8 @@ def _find_or_replay_jvp(primals, tangents, *, max_impacts: int, log_rows: int):
     _, motion, *_ = primals
     outcome, path = find(*primals, max_impacts=max_impacts, log_rows=log_rows, path_rows=motion.max_pieces(max_impacts))
     outcome, path = frozen((outcome, path))
-    return eqx.filter_jvp(lambda *args: replay(*args, path, outcome), primals, tangents)
+    repeat = lambda system, motion, state, t0, t1: replay(system, motion, state, t0, t1, path, outcome)  # noqa: E731
+    return eqx.filter_jvp(repeat, primals, tangents)
 
 
 def run(
@@ -344,7 +342,7 @@ def run(
     adjoint: Any = None,
 ) -> Outcome:
     """Move a system from t0 to t1 through its impacts, differentiably; see `simulate`."""
-    options = {"max_impacts": max_impacts, "log_rows": log_rows}
+    options: dict[str, Any] = {"max_impacts": max_impacts, "log_rows": log_rows}
     if adjoint is None:
         return _find_or_replay(system, motion, state, t0, t1, **options)
     if isinstance(adjoint, diffrax.ForwardMode):

@@ -23,7 +23,7 @@ class Piece(NamedTuple):
 
 class AbstractMotion(eqx.Module):
     """Makes the arcs of a system. `safe_steps` is how many steps of the search for a crossing one turn of the loop
-    takes; `is_closed_form` says that one piece reaches any time; `max_pieces(max_impacts)` bounds the number of arcs that a motion can be made of."""
+    takes; `is_closed_form` says that one piece reaches any time."""
 
     safe_steps: eqx.AbstractVar[int]
     is_closed_form: eqx.AbstractClassVar[bool]

@@ -138,7 +138,7 @@ class Integrated(AbstractMotion):
 
 
 def _has_no_estimate(solver: Any) -> bool:
-    return isinstance(solver, diffrax.AbstractERK) and not np.any(solver.tableau.b_error)
+    return isinstance(solver, diffrax.AbstractERK) and not np.any(getattr(solver.tableau, "b_error", 1.0))
 
 
 def _arrays(z: Any, like: Any) -> Any:

@@ -30,7 +30,9 @@ def _is_number(x: Any) -> bool:
 
 
 def _is_vector(x: Any) -> bool:
-    return (isinstance(x, tuple) and all(_is_number(c) for c in x)) or (eqx.is_inexact_array(x) and x.ndim == 1)
+    if isinstance(x, tuple):
+        return all(_is_number(c) for c in x)
+    return eqx.is_inexact_array(x) and x.ndim == 1
 
 
 def _fields(prefix: str, owner: Any, steps: tuple) -> dict[str, _Place]:

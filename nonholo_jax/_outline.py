@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ._box import Box, Rectangle
+from ._round import Cylinder, Sphere
 from ._scene import Scene
-from ._surface import AbstractSurface, Box, Cylinder, Plane, Rectangle, Sphere
+from ._surface import AbstractSurface, Plane
 
 MINUS = "\N{MINUS SIGN}"
 

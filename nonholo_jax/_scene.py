@@ -148,7 +148,8 @@ class Scene(AbstractSystem):
         for i, surface in enumerate(self.surfaces):
             checks = [*surface.is_proper(self.ball.radius), *surface.law.admissible()]
             holds += [jnp.asarray(check) for check, _ in checks]
-            holds.append(self.level(i, time, state.position) >= -16.0 * rounding(self, i, state.position))
+            depth = self.level(i, time, state.position) + 16.0 * rounding(self, i, state.position)
+            holds.append(jnp.asarray(depth >= 0))
         return jnp.all(jnp.stack(holds))
 
     def unpacked(self, state: BallState) -> Flight:
@@ -159,7 +160,7 @@ class Scene(AbstractSystem):
 
     def packed(self, state: Flight) -> BallState:
         parts = [jnp.stack(x, axis=-1) for x in (state.position, state.velocity, state.spin)]
-        return BallState(*parts, state.orientation)
+        return BallState(parts[0], parts[1], parts[2], state.orientation)
 
     def contact_frame(self, contact, time, state: Flight):
         n = select_vector(contact, [surface.direction(state.position, time) for surface in self.surfaces])

@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 
 from ._loop import run
@@ -110,6 +111,7 @@ def simulate_batch(
 
 @eqx.filter_jit
 def _run(scene, motion, state, t0, t1, max_impacts: int, log_rows: int, adjoint) -> Trajectory:
+    scene = _cast(scene, t1.dtype)
     options = {"max_impacts": max_impacts, "log_rows": log_rows, "adjoint": adjoint}
     outcome = run(scene, motion, scene.unpacked(state), t0, t1, **options)
     return packaged(scene, motion, state, t0, outcome)
@@ -117,6 +119,7 @@ def _run(scene, motion, state, t0, t1, max_impacts: int, log_rows: int, adjoint)
 
 @eqx.filter_jit
 def _run_batch(scene, motion, states, t0, t1, scene_axes, max_impacts: int, log_rows: int, adjoint) -> Trajectory:
+    scene = _cast(scene, t1.dtype)
     axes = _axes(scene, scene_axes)
     leaves, treedef = jax.tree.flatten(scene)
     mapped = [leaf for leaf, axis in zip(leaves, axes, strict=True) if axis is not None]
@@ -135,6 +138,11 @@ def _run_batch(scene, motion, states, t0, t1, scene_axes, max_impacts: int, log_
     flags = tuple(axis is not None for axis in axes) + (False,) * len(jax.tree.leaves(motion))
     moved = [leaf if axis is None else jnp.moveaxis(leaf, axis, 0) for leaf, axis in zip(leaves, axes, strict=True)]
     return dataclasses.replace(whole, system=jax.tree.unflatten(treedef, moved), motion=motion, mapped=flags)
+
+
+def _cast(scene: Any, dtype: Any) -> Any:
+    """The scene in the dtype of the state. Python numbers follow it by themselves."""
+    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, scene)
 
 
 def _axes(scene: Any, scene_axes: Any) -> list:

@@ -13,11 +13,13 @@ import numpy as np
 
 from ._air import Air
 from ._ball import Ball, BallState
+from ._box import Box, Rectangle
 from ._goal import HitTarget, Land, ReturnTo
 from ._law import Frictional, Rough, Smooth
 from ._motion import AbstractMotion, Exact
 from ._motion_integrated import Integrated
 from ._names import expand
+from ._round import Cylinder, Sphere
 from ._scene import Scene
 from ._scene_schema import (
     GOALS,
@@ -31,7 +33,7 @@ from ._scene_schema import (
     parse,
     shown,
 )
-from ._surface import Box, Cylinder, Plane, Rectangle, Sphere
+from ._surface import Plane
 
 
 class SimulateTask(NamedTuple):

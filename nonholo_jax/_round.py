@@ -1,0 +1,168 @@
+"""Spheres and cylinders, from outside and from inside."""
+
+from typing import Any
+
+import equinox as eqx
+
+from ._law import AbstractContactLaw
+from ._polynomial import Interval, Window, product, square
+from ._surface import AbstractSurface, check, nonzero, positive
+from ._types import Number, Vector3
+from ._vector import (
+    add,
+    as_number,
+    as_vector,
+    components,
+    cross,
+    dot,
+    is_constant,
+    norm,
+    plus,
+    ratio,
+    scale,
+    subtract,
+    times,
+    total,
+    unit,
+    where_number,
+)
+
+
+def _perpendicular(axis: Vector3) -> tuple[Vector3, Vector3]:
+    """Two unit vectors that complete a unit vector to an orthonormal frame."""
+    x, y, z = axis
+    if all(is_constant(c) for c in axis):
+        helper = min(range(3), key=lambda i: abs(axis[i]))
+        first = unit(cross(axis, tuple(1.0 if i == helper else 0.0 for i in range(3))))  # pyright: ignore
+    else:  # Duff et al., J. Comput. Graph. Tech. 6(1), 2017: no singular direction
+        sign = where_number(z >= 0, 1.0, -1.0)
+        a = -1.0 / (sign + z)
+        first = (1.0 + sign * x * x * a, sign * x * y * a, -sign * x)
+    return first, cross(axis, first)
+
+
+def _round_level(y: tuple, reach: Number, inside: bool) -> Number:
+    """(|y|^2 - rho^2) / 2 rho, or its opposite inside: the second derivative is exact and cheap to bound."""
+    outside = ratio(plus(dot(y, y), times(-1.0, times(reach, reach))), times(2.0, reach))
+    return times(-1.0, outside) if inside else outside
+
+
+def _round_bend(window: Window, axes: tuple, origin: Vector3, reach: Number, inside: bool) -> Interval:
+    tracks = [window.along(axis, origin) for axis in axes]
+    terms = [*[square(track.rate) for track in tracks], *[product(track.value, track.bend) for track in tracks]]
+    low, high = (ratio(total([getattr(term, end) for term in terms]), reach) for end in ("low", "high"))
+    return Interval(times(-1.0, high), times(-1.0, low)) if inside else Interval(low, high)
+
+
+_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class Sphere(AbstractSurface):
+    """A fixed sphere; the ball is outside it, or inside where `inside` is True.
+
+    **Arguments:** `center` in m, shape (3,); `radius` > 0 in m (larger than the ball's where `inside`); `law` of
+    contact; `inside`, a Python bool. Raises `ValueError` for a radius that is not positive.
+
+    ```python
+    from nonholo_jax import Smooth, Sphere
+    bowl = Sphere(center=(0.0, 0.0, 1.0), radius=1.0, law=Smooth(), inside=True)
+    ```
+    """
+
+    center: Any = eqx.field(converter=as_vector)
+    radius: Number = eqx.field(converter=as_number)
+    law: AbstractContactLaw
+    inside: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        check(self)
+
+    def _reach(self, radius):
+        return plus(self.radius, times(-1.0 if self.inside else 1.0, radius))
+
+    def distance(self, x, t):
+        outward = plus(norm(subtract(x, components(self.center))), times(-1.0, self.radius))
+        return times(-1.0 if self.inside else 1.0, outward)
+
+    def direction(self, x, t):
+        return scale(-1.0 if self.inside else 1.0, unit(subtract(x, components(self.center))))
+
+    def level(self, x, t, radius):
+        return _round_level(subtract(x, components(self.center)), self._reach(radius), self.inside)
+
+    def reach(self, x, radius):
+        return self._reach(radius) if self.inside else norm(subtract(x, components(self.center)))
+
+    def bend(self, window, t, radius):
+        return _round_bend(window, _AXES, components(self.center), self._reach(radius), self.inside)
+
+    def extent(self):
+        return plus(norm(components(self.center)), self.radius)
+
+    def is_proper(self, radius):
+        return [positive("radius", self.radius), _fits(self.radius, radius, self.inside)]
+
+
+def _fits(radius: Number, ball: Number, inside: bool) -> tuple:
+    sentence = f"`radius` must be larger than the ball's inside a surface, but got {radius} and {ball}"
+    return (radius > ball, sentence) if inside else (True, sentence)
+
+
+class Cylinder(AbstractSurface):
+    """An endless circular cylinder; the ball is outside it, or inside where `inside` is True.
+
+    **Arguments:** `point` on the axis in m, shape (3,); `axis`, shape (3,), any length but zero; `radius` > 0 in m
+    (larger than the ball's where `inside`); `law` of contact; `inside`, a Python bool. Raises `ValueError` for a zero
+    axis or a radius that is not positive.
+
+    ```python
+    from nonholo_jax import Cylinder, Rough
+    post = Cylinder(point=(1.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), radius=0.1, law=Rough())
+    ```
+    """
+
+    point: Any = eqx.field(converter=as_vector)
+    axis: Any = eqx.field(converter=as_vector)
+    radius: Number = eqx.field(converter=as_number)
+    law: AbstractContactLaw
+    inside: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        check(self)
+
+    def _reach(self, radius):
+        return plus(self.radius, times(-1.0 if self.inside else 1.0, radius))
+
+    def _across(self, x):
+        axes = _perpendicular(unit(components(self.axis)))
+        d = subtract(x, components(self.point))
+        return axes, tuple(dot(axis, d) for axis in axes)
+
+    def distance(self, x, t):
+        _, y = self._across(x)
+        return times(-1.0 if self.inside else 1.0, plus(norm(y), times(-1.0, self.radius)))
+
+    def direction(self, x, t):
+        axes, y = self._across(x)
+        n = scale(-1.0 if self.inside else 1.0, unit(y))
+        return add(scale(n[0], axes[0]), scale(n[1], axes[1]))
+
+    def level(self, x, t, radius):
+        return _round_level(self._across(x)[1], self._reach(radius), self.inside)
+
+    def reach(self, x, radius):
+        return self._reach(radius) if self.inside else norm(self._across(x)[1])
+
+    def bend(self, window, t, radius):
+        axes = _perpendicular(unit(components(self.axis)))
+        return _round_bend(window, axes, components(self.point), self._reach(radius), self.inside)
+
+    def extent(self):
+        return plus(norm(components(self.point)), self.radius)
+
+    def is_proper(self, radius):
+        return [
+            nonzero("axis", self.axis),
+            positive("radius", self.radius),
+            _fits(self.radius, radius, self.inside),
+        ]
