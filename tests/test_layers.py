@@ -22,6 +22,8 @@ ORDER = [
     # world
     "_ball",
     "_surface",
+    "_box",
+    "_round",
     "_air",
     "_scene",
     # motion
@@ -41,6 +43,7 @@ ORDER = [
     "_scene_schema",
     "scene_file",
     "_outline",
+    "_samples",
     "plot",
     "cli",
 ]
