@@ -45,6 +45,7 @@ class Search(NamedTuple):
     """How far the search has come along an arc."""
 
     s: Scalar  # local time up to which no contact is crossed
+    window: Scalar  # how far ahead the next step looks for its bound
     contact: Index  # the contact that is crossed at s, or -1
     finished: Bool[Array, ""]  # a contact is crossed or the end of the arc is reached
 
@@ -52,9 +53,10 @@ class Search(NamedTuple):
 class _Step(NamedTuple):
     size: Scalar  # to the first zero of the parabola below the level, or to the end of the window
     hit: Bool[Array, ""]  # the level itself is zero there
+    clear: Bool[Array, ""]  # the whole window is free of zeros
 
 
-def _safe_step(system: AbstractSystem, contact: int, arc: Arc, s: Any, touching: Any) -> _Step:
+def _safe_step(system: AbstractSystem, contact: int, arc: Arc, s: Any, window: Any, touching: Any) -> _Step:
     q, tangent = arc.position(s), arc.tangent(s)
     left = arc.length - s
     value, rate = slope(lambda x: system.level(contact, arc.time, x), q, tangent)
@@ -68,6 +70,8 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, s: Any, touching:
         bends = [evaluate(derivative(derivative(p)), 0.0) for p in coefficients]
         speed = norm(tangent) + jnp.sqrt(norm(bends) * reach)
         width = jnp.where(speed * left > 2.0 * reach, 2.0 * reach / jnp.where(speed > 0, speed, 1.0), left)
+    if not exact:
+        width = jnp.minimum(width, window)
     bend = system.bend(contact, arc.time, Window(coefficients, width))
     m, most = (jnp.asarray(x, dtype=arc.time.dtype) for x in bend)
     value, rate, m, most, width = shared([value, rate, m, most, width], s)
@@ -82,39 +86,45 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, s: Any, touching:
     rising = jnp.where(m < 0, (rate + edge) / _nonzero(-m), jnp.inf)
     zero = jnp.where(rate < 0, falling, rising)
     if exact:
-        return _Step(zero, zero <= left)
+        return _Step(zero, zero <= left, zero > left)
     # One Newton step from here leaves an error of bend (value / rate)^2 / 2: where that is rounding, the zero is found.
     sharpest = jnp.maximum(jnp.abs(m), jnp.abs(most))
-    clear = (rate < 0) & (sharpest * value * value <= tolerance * rate * rate) & (value <= -rate * width)
+    found = (rate < 0) & (sharpest * value * value <= tolerance * rate * rate) & (value <= -rate * width)
     near = (value <= tolerance) & ((rate < 0) | ((rate == 0) & (m < 0)))
     last = jnp.where(rate < 0, jnp.minimum(value / _nonzero(-rate), left), 0.0)
-    return _Step(jnp.where(near | clear, last, jnp.minimum(zero, width)), near | clear)
+    hit = near | found
+    return _Step(jnp.where(hit, last, jnp.minimum(zero, width)), hit, zero >= width)
 
 
 def _nonzero(x: Any) -> Any:
     return jnp.where(x == 0, jnp.asarray(jnp.finfo(x.dtype).tiny, dtype=x.dtype), x)
 
 
-def search(system: AbstractSystem, arc: Arc, start: Any, touching: Index, n_steps: int) -> Search:
+def search(system: AbstractSystem, arc: Arc, start: Any, window: Any, touching: Index, n_steps: int) -> Search:
     """At most `n_steps` safe steps along an arc, from local time `start` up to which no contact is crossed. `touching`
-    is the contact that was left at the beginning of the arc, or -1. Not differentiated."""
+    is the contact that was left at the beginning of the arc, or -1. The `window` follows the size of the steps, so
+    that the bound is tight where they are small: past a near miss it then turns positive at once. Not differentiated.
+    """
     arc, system = frozen(arc), frozen(system)
     none = jnp.asarray(-1, dtype=jnp.int32)
 
     def step(state: Search) -> Search:
-        size, contact, hit = jnp.asarray(jnp.inf, dtype=state.s.dtype), none, jnp.asarray(False)
+        size, contact = jnp.asarray(jnp.inf, dtype=state.s.dtype), none
+        hit, clear = jnp.asarray(False), jnp.asarray(True)
         for i in range(system.n_contacts):
-            each = _safe_step(system, i, arc, state.s, touching == i)
+            each = _safe_step(system, i, arc, state.s, state.window, touching == i)
             closer = each.size < size  # a tie goes to the first
             size = jnp.where(closer, each.size, size)
             contact = jnp.where(closer, i, contact).astype(jnp.int32)
             hit = jnp.where(closer, each.hit, hit)
+            clear = jnp.where(closer, each.clear, clear)
         hit = hit & (state.s + size <= arc.length)
         s = jnp.minimum(state.s + size, arc.length)
-        found = Search(s, jnp.where(hit, contact, none), hit | (state.s + size >= arc.length))
+        ahead = jnp.where(clear, 4.0, 2.0) * jnp.minimum(size, arc.length)
+        found = Search(s, ahead, jnp.where(hit, contact, none), hit | (state.s + size >= arc.length))
         return Search(*[jnp.where(state.finished, a, b) for a, b in zip(state, found, strict=True)])
 
-    state = Search(start, none, start >= arc.length)
+    state = Search(start, window, none, start >= arc.length)
     if n_steps == 1 or system.n_contacts == 0:
         return step(state)
     going = lambda c: (c[0] < n_steps) & eqxi.unvmap_any(~c[1].finished)  # noqa: E731

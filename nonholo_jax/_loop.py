@@ -66,6 +66,7 @@ class _Carry(NamedTuple):
     memory: Any
     # how the present arc is searched
     s: Any  # local time up to which no contact is crossed
+    window: Any  # how far ahead the search looks
     touching: Any  # contact just left, or -1
     jumped: Any  # an impact has happened since the last arc
     control: Any
@@ -137,6 +138,7 @@ def _start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> _Car
         state=state,
         memory=memory,
         s=jnp.zeros_like(t0),
+        window=jnp.full_like(t0, jnp.inf),
         touching=zero - 1,
         jumped=jnp.asarray(True),
         control=control,
@@ -161,7 +163,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     piece = motion.piece(system, c.time, c.state, c.memory, c.jumped, length)
     arc = piece.arc
     kept, control = motion.judge(c.control, size, piece.trial)
-    found = search(system, arc, c.s, c.touching, motion.safe_steps)
+    found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
     kept, finished = _shared_flags((kept, found.finished), c.since)
     ended = kept & finished
     crossed = ended & (found.contact >= 0)
@@ -209,6 +211,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
         state=_keep(ended, _keep(struck, after, arrived), c.state),
         memory=_keep(ended, piece.memory, c.memory),
         s=jnp.where(kept & ~ended, frozen(found.s), 0.0),
+        window=jnp.where(kept & ~ended, frozen(found.window), jnp.inf),
         touching=jnp.where(struck, found.contact, jnp.where(through, -1, c.touching)),
         jumped=jnp.where(ended, struck, c.jumped),
         control=_keep(ended | ~kept, control, c.control),
@@ -268,11 +271,11 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         arc = piece.arc
         crossed = used & (contact >= 0)
         if system.n_contacts > 0:
-            s = jnp.where(crossed, corrected(system, arc, s, contact), s)
+            (s,) = shared([jnp.where(crossed, corrected(system, arc, s, contact), s)], time)
         s = jnp.where(last, arc.length, s)
         s = jnp.where(used, s, 0.0)
         elapsed = s * arc.unit
-        arrived = _arrays(system.advanced(state, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
+        arrived = _shared(_arrays(system.advanced(state, arc.position(s), arc.velocity(s), elapsed), t1.dtype), time)
         moved = jnp.where(last, t1, time + elapsed)
         struck = crossed & (n_impacts < known.n_impacts)
         after = arrived

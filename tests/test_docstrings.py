@@ -10,7 +10,6 @@ import pytest
 
 import nonholo_jax
 
-
 README = pathlib.Path(__file__).parents[1] / "README.md"
 BLOCK = re.compile(r"^([ \t]*)```python\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 

@@ -7,7 +7,6 @@ import pytest
 
 import nonholo_jax
 
-
 PACKAGE = pathlib.Path(nonholo_jax.__file__).parent
 # From the ground up. `_motion*` and the faces may be several files.
 ORDER = [
