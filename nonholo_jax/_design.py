@@ -14,7 +14,7 @@ from ._ball import BallState
 from ._goal import AbstractGoal
 from ._names import expand, read, write
 from ._scene import Scene
-from ._simulate import simulate
+from ._simulate import checked, simulate
 from ._trajectory import Trajectory
 from ._types import RESULTS, is_failure, result_name
 
@@ -136,14 +136,16 @@ def design(
     tolerance = (1e-6 if dtype == jnp.float64 else 1e-3) if tolerance is None else tolerance
     wanted = _wanted(scene, itinerary)
     times = (jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
-    problem = _Problem(scene, state, goal, *times, names, wanted, max_impacts, motion)
+    motion, _ = checked(scene, motion, max_impacts, None)
+    timed = isinstance(goal, AbstractGoal) and goal.passes_after is not None and not motion.is_closed_form
+    problem = _Problem(scene, state, goal, *times, names, wanted, max_impacts, motion, timed)
     first = read(scene, state, names)
     chart = _chart(scene, state, names, first, _limits(scene, state, names, bounds or {}, dtype))
     key = jax.random.key(0) if key is None else key
     initial = _starts(problem, chart, first, n_starts, key)
     solver = _least_squares_solver(solver)
-    found, (miss, met, hit, result, time), steps = _descend(problem, chart, initial, solver, max_steps)
-    starts = Starts(jax.vmap(chart.value)(initial), jax.vmap(chart.value)(found), miss, met, steps, hit, result)
+    begun, found, (miss, met, hit, result, time), steps = _descend(problem, chart, initial, solver, max_steps)
+    starts = Starts(begun, found, miss, met, steps, hit, result)
     best = _best(starts, chart, first, tolerance)
     values = starts.found[best]
     scene, state = write(scene, state, names, values)
@@ -178,6 +180,7 @@ class _Problem(eqx.Module):
     wanted: tuple[int, ...] | None = eqx.field(static=True)
     max_impacts: int = eqx.field(static=True)
     motion: Any
+    timed: bool = eqx.field(static=True)  # the time of passing through the goal is one more coordinate, the last
 
     def trajectory(self, values: Any, t1: Any = None) -> Trajectory:
         scene, state = write(self.scene, self.state, self.names, values)
@@ -193,11 +196,37 @@ class _Problem(eqx.Module):
             residual, time = self.goal.residual(trajectory, required)
         else:
             residual, time = jnp.ravel(self.goal(trajectory)), trajectory.t1
-        met = self.met(trajectory) & jnp.all(jnp.isfinite(residual))
+        return self._judged(residual, self.met(trajectory), trajectory, time)
+
+    def _judged(self, residual: Any, met: Any, trajectory: Trajectory, time: Any) -> tuple[Any, tuple]:
+        met = met & jnp.all(jnp.isfinite(residual))
         ok = met & (trajectory.result != RESULTS.invalid_state)
         miss = jnp.sqrt(jnp.sum(jnp.where(ok, jax.lax.stop_gradient(residual), 0.0) ** 2))
         aside = (jnp.where(ok, miss, jnp.inf), met, trajectory.impacts.surface, trajectory.result, time)
         return jnp.where(ok, residual, _REFUSED), aside
+
+    def passing(self, values: Any, time: Any) -> tuple[Any, tuple]:
+        """`residual` for a goal of passing through a point, at a time that is given."""
+        trajectory = self.trajectory(values, time)
+        residual = trajectory.final.position - self.goal.point.astype(time.dtype)
+        met = self.met(trajectory) & (trajectory.result == RESULTS.reached_t1)
+        if self.wanted is None:
+            met = met & (trajectory.n_impacts >= self.goal.passes_after)
+        return self._judged(residual, met, trajectory, time)
+
+    def at(self, u: Any, chart: "_Chart") -> tuple[Any, tuple]:
+        """The residual at a point of the chart."""
+        if not self.timed:
+            return self.residual(chart.value(u))
+        time = self.t0 + 0.5 * (self.t1 - self.t0) * (1.0 + jnp.sin(u[-1]))
+        return self.passing(chart.value(u[:-1]), time)
+
+    def with_time(self, u: Any, time: Any) -> Any:
+        """The inverse of what `at` does to the last coordinate, appended to the others."""
+        if not self.timed:
+            return u
+        part = 2.0 * (jnp.where(jnp.isfinite(time), time, self.t1) - self.t0) / (self.t1 - self.t0) - 1.0
+        return jnp.concatenate([u, jnp.arcsin(jnp.clip(part, -0.999999, 0.999999))[None]])
 
     def met(self, trajectory: Trajectory) -> Any:
         if self.wanted is None:
@@ -277,6 +306,7 @@ def _least_squares_solver(solver: Any) -> Any:
     return solver
 
 
+@eqx.filter_jit
 def _starts(problem: _Problem, chart: _Chart, first: Any, n_starts: int, key: Any) -> Any:
     """The first guess and the best of many random candidates, in coordinates."""
     shape = (n_starts * _CANDIDATES_PER_START - 1, first.size)
@@ -285,14 +315,14 @@ def _starts(problem: _Problem, chart: _Chart, first: Any, n_starts: int, key: An
     normal = jax.random.normal(spread, shape, first.dtype)
     uniform = jax.random.uniform(flat, shape, first.dtype, minval=-1.0, maxval=1.0)
     u = jnp.concatenate([chart.coordinate(first)[None], jnp.where(bounded[None], jnp.arcsin(uniform), normal)])
-    miss = _screen(problem, chart, u)
-    order = jnp.argsort(jnp.where(jnp.arange(u.shape[0]) == 0, -1.0, miss))  # the first guess always takes part
-    return u[order[:n_starts]]
+    miss, _, _, _, time = jax.vmap(lambda each: problem.residual(chart.value(each))[1])(u)
+    order = jnp.argsort(miss.at[0].set(-1.0))[:n_starts]  # the first guess always takes part
+    return jax.vmap(problem.with_time)(u[order], time[order])
 
 
 @eqx.filter_custom_jvp
 def _residual(u: Any, *, problem: _Problem, chart: _Chart) -> tuple[Any, tuple]:
-    return problem.residual(chart.value(u))
+    return problem.at(u, chart)
 
 
 @_residual.def_jvp
@@ -300,14 +330,9 @@ def _residual_jvp(primals, tangents, *, problem: _Problem, chart: _Chart):
     """The whole Jacobian in one forward pass, and its product with the tangent. A solver that linearizes the residual
     then compiles this one program, instead of a value, its linearization and what reverse mode would want to keep."""
     (u,), (du,) = primals, tangents
-    push = lambda e: jax.jvp(lambda u: problem.residual(chart.value(u)), (u,), (e,), has_aux=True)  # noqa: E731
+    push = lambda e: jax.jvp(lambda u: problem.at(u, chart), (u,), (e,), has_aux=True)  # noqa: E731
     value, columns, aside = jax.vmap(push, out_axes=(None, 1, None))(jnp.eye(u.size, dtype=u.dtype))
     return (value, aside), (columns @ du, jax.tree.map(lambda _: None, aside))
-
-
-@eqx.filter_jit
-def _screen(problem: _Problem, chart: _Chart, u: Any) -> Any:
-    return jax.vmap(lambda each: problem.residual(chart.value(each))[1][0])(u)
 
 
 def _loss(u: Any, problem: _Problem, chart: _Chart) -> tuple[Any, tuple]:
@@ -323,7 +348,8 @@ def _descend(problem: _Problem, chart: _Chart, initial: Any, solver: Any, max_st
             solution = optx.least_squares(lambda u, _: _residual(u, problem=problem, chart=chart), solver, u, **options)
         else:
             solution = optx.minimise(lambda u, _: _loss(u, problem, chart), solver, u, **options)
-        return solution.value, solution.aux, solution.stats["num_steps"]
+        d = len(problem.names)
+        return chart.value(u[:d]), chart.value(solution.value[:d]), solution.aux, solution.stats["num_steps"]
 
     return jax.vmap(one)(initial)
 

@@ -1,7 +1,7 @@
 """What a throw is designed for."""
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -20,7 +20,13 @@ _NEWTON_STEPS = 4
 
 
 class AbstractGoal(eqx.Module):
-    """A differentiable residual of a trajectory, zero where the goal is reached."""
+    """A differentiable residual of a trajectory, zero where the goal is reached.
+
+    A goal of passing through a point sets `passes_after`, the number of impacts that must come first where there is no
+    itinerary. A search may then treat the time of passing as one more free number, which saves it the search for the
+    closest approach at every step."""
+
+    passes_after: eqx.AbstractClassVar[int | None]
 
     @abstractmethod
     def residual(self, trajectory: Trajectory, n_required: int | None) -> tuple[Float[Array, " n"], Scalar]:
@@ -32,6 +38,7 @@ class ReturnTo(AbstractGoal):
     """The ball's centre comes back to `point` (in m, shape (3,)) on the arc after the itinerary's last impact, or,
     without an itinerary, on any arc after the first impact. The residual is the vector of closest approach."""
 
+    passes_after: ClassVar[int | None] = 1
     point: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
 
     def residual(self, trajectory, n_required):
@@ -42,6 +49,7 @@ class HitTarget(AbstractGoal):
     """The ball's centre passes through `point` (in m, shape (3,)) on the arc after the itinerary's last impact, or,
     without an itinerary, on any arc, the first included."""
 
+    passes_after: ClassVar[int | None] = 0
     point: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
 
     def residual(self, trajectory, n_required):
@@ -52,6 +60,7 @@ class Land(AbstractGoal):
     """The contact point of an impact is at `point` (in m, shape (3,)): of the itinerary's last impact, or, without an
     itinerary, of the first impact on the surface named `surface` (on any surface if `None`)."""
 
+    passes_after: ClassVar[int | None] = None
     point: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
     surface: str | None = eqx.field(static=True, default=None)
 

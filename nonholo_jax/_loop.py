@@ -295,7 +295,7 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
     def chunk(carry, steps):
         def run(carry):
             inner, buffer = carry
-            inner, (rows, where) = lax.scan(jax.checkpoint(one), inner, steps)
+            inner, (rows, where) = lax.scan(jax.checkpoint(one, prevent_cse=False), inner, steps)
             return inner, buffer.at[where].set(rows, mode="drop") if log_rows else buffer
 
         needed = eqxi.unvmap_any(steps[0][0] < known.n_arcs)

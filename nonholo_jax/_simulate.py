@@ -59,7 +59,7 @@ def simulate(
     trajectory.final.position, trajectory.n_impacts
     ```
     """
-    motion, log_rows = _checked(scene, motion, max_impacts, log_size)
+    motion, log_rows = checked(scene, motion, max_impacts, log_size)
     _check_shapes(state, batch=False)
     dtype = jax.tree.leaves(state)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
@@ -100,7 +100,7 @@ def simulate_batch(
     simulate_batch(scene, throws, t1=1.0).final.position.mean(axis=0)
     ```
     """
-    motion, log_rows = _checked(scene, motion, max_impacts, log_size)
+    motion, log_rows = checked(scene, motion, max_impacts, log_size)
     _check_shapes(states, batch=True)
     dtype = jax.tree.leaves(states)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
@@ -159,7 +159,7 @@ def _axes(scene: Any, scene_axes: Any) -> list:
     return [axis if eqx.is_array(leaf) else None for axis, leaf in zip(spread, leaves, strict=True)]
 
 
-def _checked(scene: Any, motion: Any, max_impacts: int, log_size: int | None) -> tuple[AbstractMotion, int]:
+def checked(scene: Any, motion: Any, max_impacts: int, log_size: int | None) -> tuple[AbstractMotion, int]:
     if not isinstance(scene, AbstractSystem):
         raise ValueError(
             f"Argument `scene` must be a Scene, but got {type(scene).__name__}; try Scene(ball, surfaces)."

@@ -26,6 +26,7 @@ from nonholo_jax import (
     simulate,
     simulate_batch,
 )
+from nonholo_jax._types import result_name
 
 EPS = np.finfo(np.float64).eps
 R = 0.1
@@ -128,7 +129,7 @@ def check_log(scene, trajectory, lanes):
     inward = np.sum(np.asarray(log.normal) * np.asarray(log.before.velocity), axis=-1)
     outward = np.sum(np.asarray(log.normal) * np.asarray(log.after.velocity), axis=-1)
     assert np.all(inward[used] < 0) and np.all(outward[used] >= 0)
-    assert np.all(np.diff(np.where(used, np.asarray(log.time), np.inf), axis=1)[used[:, 1:]] >= 0)
+    assert np.all(np.diff(np.asarray(log.time), axis=1)[used[:, 1:]] >= 0)
     times = np.linspace(0.0, 1.0, 64) * float(trajectory.t1[np.flatnonzero(lanes)[0]])
     places = np.asarray(trajectory.at(times).position)[lanes]
     for each in scene.surfaces:
@@ -154,75 +155,67 @@ def test_errors_fall_with_the_tolerance(name, getkey):
     surfaces, sampler = air_scenes()[name]
     scene = Scene(Ball(R, LIGHT), surfaces, GRAVITY, Air(**AIR))
     throw = sampler(generator(getkey()))
-    run = jax.jit(
-        lambda tolerance: simulate_batch(
-            scene, throw, t1=0.6, max_impacts=16,
-            motion=Integrated(stepsize_controller=diffrax.PIDController(tolerance, tolerance), max_steps=2048),
-        )
-    )  # fmt: skip
-    best = run(1e-13)
-    fine = np.array(results_of(best)) == "reached_t1"
-    assert fine.sum() > 190 and np.asarray(best.n_impacts).mean() > 1
+
+    @jax.jit
+    def run(tolerance):
+        motion = Integrated(stepsize_controller=diffrax.PIDController(tolerance, tolerance), max_steps=2048)
+        end = simulate_batch(scene, throw, t1=0.6, max_impacts=16, motion=motion)
+        return end.final.position, end.impacts.surface, end.result, end.n_impacts
+
+    names = lambda result: np.array([result_name(lane(result, i)) for i in range(len(throw.position))])  # noqa: E731
+    best, itinerary, result, counts = run(1e-13)
+    fine = names(result) == "reached_t1"
+    assert fine.sum() > 190 and np.asarray(counts).mean() > 1
     errors = []
     for tolerance in (1e-6, 1e-8, 1e-10):
-        each = run(tolerance)
-        same = np.all(np.asarray(each.impacts.surface) == np.asarray(best.impacts.surface), axis=1)
-        assert same[fine].sum() >= fine.sum() - (1 if tolerance > 1e-7 else 0)  # one lane may be near to grazing
-        errors.append(
-            np.median(
-                np.abs(np.asarray(each.final.position) - np.asarray(best.final.position)).max(axis=1)[fine & same]
-            )
-        )
+        position, surface, *_ = run(tolerance)
+        same = np.all(np.asarray(surface) == np.asarray(itinerary), axis=1)
+        assert np.all(same[fine])
+        errors.append(np.median(np.abs(np.asarray(position - best)).max(axis=1)[fine]))
     assert errors[0] < 1e-4 and errors[1] < errors[0] / 10 and errors[2] < errors[1] / 10 and errors[2] < 1e-8
 
 
-# Order of convergence. A method without error estimate takes constant steps; an impact restarts them.
+# Order of convergence, with constant steps that an impact restarts. The ball is light and spins fast, so that its path
+# is a spiral: where the force hardly changes, methods of order 5 look better than they are at steps that are usable.
 
 SOLVERS = {
-    "euler": (diffrax.Euler(), 1, (64, 91, 128, 181, 256)),
-    "heun": (diffrax.Heun(), 2, (32, 45, 64, 91, 128)),
-    "midpoint": (diffrax.Midpoint(), 2, (32, 45, 64, 91, 128)),
-    "ralston": (diffrax.Ralston(), 2, (32, 45, 64, 91, 128)),
-    "bosh3": (diffrax.Bosh3(), 3, (16, 23, 32, 45, 64)),
-    "tsit5": (diffrax.Tsit5(), 5, (8, 11, 16, 23, 32)),
-    "dopri5": (diffrax.Dopri5(), 5, (8, 11, 16, 23, 32)),
+    "euler": (diffrax.Euler(), 1),  # through `init` and `step`; the rest through their tableau
+    "heun": (diffrax.Heun(), 2),
+    "midpoint": (diffrax.Midpoint(), 2),
+    "ralston": (diffrax.Ralston(), 2),
+    "bosh3": (diffrax.Bosh3(), 3),
+    "tsit5": (diffrax.Tsit5(), 5),
+    "dopri5": (diffrax.Dopri5(), 5),
 }
 
 
-def air_bounce(motion, velocity=(6.0, 1.0, -3.0)):
+def air_bounce(solver, h):
     scene = Scene(Ball(R, LIGHT), {"floor": floor(Rough(0.8))}, GRAVITY, Air(**AIR))
-    return simulate(scene, BallState([0, 0, 1.0], velocity, [5.0, 60.0, -20.0]), t1=0.5, max_impacts=1, motion=motion)
+    motion = Integrated(solver=solver, stepsize_controller=diffrax.ConstantStepSize(), dt0=h, max_steps=2048)
+    throw = BallState([0, 0, 0.6], [6.0, 1.0, -3.0], [5.0, 150.0, -100.0])
+    return simulate(scene, throw, t1=0.5, max_impacts=1, motion=motion, throw=False)
 
 
 @pytest.fixture(scope="module")
 def reference():
-    end = air_bounce(Integrated(solver=diffrax.Dopri8(), rtol=1e-14, atol=1e-14))
-    assert int(end.n_impacts) == 1
+    end = air_bounce(diffrax.Dopri8(), 0.5 / 1500)
+    assert int(end.n_impacts) == 1 and result_name(end.result) == "reached_t1"
     return np.asarray(stacked(end.final))
 
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_order_of_convergence_through_an_impact(name, reference):
-    """The impact cuts a step where the solver's interpolant crosses the floor, and what it crosses with goes on: the
-    interpolant must be as good as the step, but for one power of h, since it is used a fixed number of times."""
-    solver, order, counts = SOLVERS[name]
-    errors, steps = [], []
-    constant = diffrax.ConstantStepSize()
-
-    @jax.jit
-    def run(h):
-        motion = Integrated(solver=solver, stepsize_controller=constant, dt0=h, max_steps=512)
-        return stacked(air_bounce(motion).final)
-
-    for count in counts:
-        # The place of the impact in its step is a periodic function of 1/h: the mean of several h smooths it out.
-        sizes = 0.5 / (count + np.linspace(0, 0.06 * count, 7))
-        each = [np.abs(np.asarray(run(jnp.asarray(h))) - reference)[:6].max() for h in sizes]
-        errors.append(np.exp(np.mean(np.log(each))))
-        steps.append(np.exp(np.mean(np.log(sizes))))
-    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
-    assert slope > order - 0.2, (slope, errors)
-    assert slope < order + 0.9, (slope, errors)
+    """The impact cuts a step where the solver's interpolant crosses the floor. Interpolants are one order below their
+    method (Tsit5: 4), but each impact uses one once only, so that its local error is of the method's global order:
+    nothing is lost."""
+    solver, order = SOLVERS[name]
+    counts = np.array([64, 90, 128, 181, 256]) * (2 if order == 1 else 1)
+    # The place of the impact in its step is a periodic function of 1/h: the mean of several h smooths it out.
+    sizes = 0.5 / (counts[:, None] * np.linspace(1, 1.06, 9))
+    ends = jax.jit(jax.vmap(jax.vmap(lambda h: stacked(air_bounce(solver, h).final))))(jnp.asarray(sizes))
+    errors = np.mean(np.log(np.abs(np.asarray(ends) - reference)[..., :6].max(axis=-1)), axis=1)
+    slope = np.polyfit(np.mean(np.log(sizes), axis=1), errors, 1)[0]
+    assert abs(slope - order) < 0.2, (slope, np.exp(errors))
 
 
 # What every motion keeps
@@ -240,7 +233,7 @@ def elastic_scenes():
         "table": (
             {"floor": floor(laws[0]), "table": Box((0, 0, 0.7), (0.6, 0.4, 0.05), laws[1])},
             lambda rng: random_states(rng, 64, (-1.2, -1, 0.9), (1.2, 1, 1.5), 2.0),
-            0.7,
+            1.2,
         ),
     }
 
