@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool
 from ._polynomial import Polynomial, Window, derivative, evaluate, recentred
 from ._system import AbstractSystem, rounding
 from ._types import Index, Number, Scalar
-from ._vector import frozen, norm, select, shared, slope
+from ._vector import frozen, norm, select, shared, slope, times
 
 
 class Arc(eqx.Module):
@@ -56,19 +56,38 @@ class _Step(NamedTuple):
     clear: Bool[Array, ""]  # the whole window is free of zeros
 
 
-def _safe_step(system: AbstractSystem, contact: int, arc: Arc, s: Any, window: Any, touching: Any) -> _Step:
-    q, tangent = arc.position(s), arc.tangent(s)
-    left = arc.length - s
-    value, rate = slope(lambda x: system.level(contact, arc.time, x), q, tangent)
-    # Near the contact q may be small, but it is the sum of numbers that are not, and s is rounded too.
-    tolerance = rounding(system, contact, [evaluate(tuple(abs(c) for c in p), s) for p in arc.configuration])
+class _Here(NamedTuple):
+    """The path from local time s on, shared by all contacts."""
+
+    s: Scalar
+    coefficients: tuple[Polynomial, ...]  # in powers of time - s: position, tangent, half the second derivative, ...
+    size: tuple  # of the numbers that the position is the sum of: what its rounding goes by
+
+    @property
+    def position(self) -> tuple:
+        return tuple(p[0] for p in self.coefficients)
+
+    @property
+    def tangent(self) -> tuple:
+        return tuple(p[1] for p in self.coefficients)
+
+
+def _here(arc: Arc, s: Any) -> _Here:
     coefficients = tuple(recentred(p, s) for p in arc.configuration)
-    reach = system.reach(contact, q)
+    return _Here(s, coefficients, tuple(evaluate(tuple(abs(c) for c in p), s) for p in arc.configuration))
+
+
+def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, window: Any, touching: Any) -> _Step:
+    s, coefficients, size = here
+    left = arc.length - s
+    value, rate = slope(lambda x: system.level(contact, arc.time, x), here.position, here.tangent)
+    tolerance = rounding(system, contact, size)
+    reach = system.reach(contact, here.position)
     exact = reach is None and all(len(p) <= 3 for p in coefficients)
     width = left
     if reach is not None:
-        bends = [evaluate(derivative(derivative(p)), 0.0) for p in coefficients]
-        speed = norm(tangent) + jnp.sqrt(norm(bends) * reach)
+        bends = [times(2.0, p[2]) if len(p) > 2 else 0.0 for p in coefficients]
+        speed = norm(here.tangent) + jnp.sqrt(norm(bends) * reach)
         width = jnp.where(speed * left > 2.0 * reach, 2.0 * reach / jnp.where(speed > 0, speed, 1.0), left)
     if not exact:
         width = jnp.minimum(width, window)
@@ -111,8 +130,9 @@ def search(system: AbstractSystem, arc: Arc, start: Any, window: Any, touching: 
     def step(state: Search) -> Search:
         size, contact = jnp.asarray(jnp.inf, dtype=state.s.dtype), none
         hit, clear = jnp.asarray(False), jnp.asarray(True)
+        here = _here(arc, state.s)
         for i in range(system.n_contacts):
-            each = _safe_step(system, i, arc, state.s, state.window, touching == i)
+            each = _safe_step(system, i, arc, here, state.window, touching == i)
             closer = each.size < size  # a tie goes to the first
             size = jnp.where(closer, each.size, size)
             contact = jnp.where(closer, i, contact).astype(jnp.int32)
@@ -140,12 +160,12 @@ class Meeting(NamedTuple):
 
 
 def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meeting:
-    q, tangent = arc.position(s), arc.tangent(s)
-    here = Window(tuple(recentred(p, s) for p in arc.configuration), 0.0)
+    here = _here(arc, s)
     columns = []
     for i in range(system.n_contacts):
-        value, rate = slope(lambda x, i=i: system.level(i, arc.time, x), q, tangent)
-        columns.append((value, rate, system.bend(i, arc.time, here).low, rounding(system, i, q)))
+        value, rate = slope(lambda x, i=i: system.level(i, arc.time, x), here.position, here.tangent)
+        bend = system.bend(i, arc.time, Window(here.coefficients, 0.0))
+        columns.append((value, rate, bend.low, rounding(system, i, here.size)))
     value, rate, bend, tolerance = shared([select(contact, column) for column in zip(*columns, strict=True)], s)
     return Meeting(value, rate, (bend < 0) & (rate * rate <= -2.0 * bend * tolerance))  # pyright: ignore
 

@@ -159,13 +159,13 @@ def test_errors_fall_with_the_tolerance(name, getkey):
     @jax.jit
     def run(tolerance):
         motion = Integrated(stepsize_controller=diffrax.PIDController(tolerance, tolerance), max_steps=2048)
-        end = simulate_batch(scene, throw, t1=0.6, max_impacts=16, motion=motion)
+        end = simulate_batch(scene, throw, t1=1.0, max_impacts=16, motion=motion)
         return end.final.position, end.impacts.surface, end.result, end.n_impacts
 
     names = lambda result: np.array([result_name(lane(result, i)) for i in range(len(throw.position))])  # noqa: E731
     best, itinerary, result, counts = run(1e-13)
     fine = names(result) == "reached_t1"
-    assert fine.sum() > 190 and np.asarray(counts).mean() > 1
+    assert fine.sum() > 190 and np.asarray(counts).mean() > 0.8
     errors = []
     for tolerance in (1e-6, 1e-8, 1e-10):
         position, surface, *_ = run(tolerance)

@@ -181,13 +181,12 @@ def test_log_adds_up():
 def test_grazing_is_flagged():
     ceiling = {"ceiling": Plane((0.0, 0.0, 1.0 + R), (0.0, 0.0, -1.0), Rough())}
     scene = Scene(Ball(R, 1.0), ceiling, gravity=(0.0, 0.0, -8.0))
-    rise = np.sqrt(2 * 8.0 * (1.0 + np.array([1e-18 + 4 * np.finfo(float).eps, 1e-2])))
+    rise = np.sqrt(2 * 8.0 * (1.0 + np.array([1e-13, 1e-2])))  # closing speeds of 1.3e-6 and 0.4 m/s
     zero = np.zeros(2)
-    throw = states(np.zeros((2, 3)), np.c_[zero + 1.0, zero, rise], np.zeros((2, 3)))
+    throw = states(np.zeros((2, 3)), np.c_[zero + 1e3, zero, rise], np.zeros((2, 3)))
     end = simulate_batch(scene, throw, t1=1.0, max_impacts=4)
-    assert np.asarray(end.n_impacts)[1] == 1 and not bool(end.impacts.grazing[1, 0])
-    assert np.asarray(end.n_impacts)[0] in (0, 1)
-    assert bool(end.impacts.grazing[0, 0]) == bool(end.n_impacts[0] == 1)
+    assert np.asarray(end.n_impacts).tolist() == [1, 1]
+    assert np.asarray(end.impacts.grazing[:, 0]).tolist() == [True, False]
 
 
 def test_time_may_start_anywhere():
@@ -225,7 +224,7 @@ def test_batch_is_one_by_one(motion):
 @pytest.mark.parametrize("axes", ["zero", "tree", "none"])
 def test_scene_axes(axes):
     n, throw = 4, sampled(4)
-    restitution = jnp.linspace(0.5, 0.9, n)
+    restitution = jnp.linspace(0.75, 0.9, n)
     height = jnp.asarray(-0.25)
     if axes == "zero":  # every array of the scene is sampled
         scene = eqx.filter_vmap(lambda e: scene_with(e))(restitution)
@@ -294,10 +293,8 @@ SENTENCE = re.compile(r"^(Arguments?|Surface) [^\n]+\.$")
 BUMP = {"bump": Implicit(lambda x, t: x[2], Rough())}
 
 WRONG = {
-    "scene": lambda: simulate({"floor": FLOOR}, THROW, t1=1.0),
     "max_impacts": lambda: simulate(SCENE, THROW, t1=1.0, max_impacts=-1),
-    "log_size": lambda: simulate(SCENE, THROW, t1=1.0, log_size=1.5),
-    "motion": lambda: simulate(SCENE, THROW, t1=1.0, motion="exact"),
+    "log_size": lambda: simulate(SCENE, THROW, t1=1.0, log_size=-2),
     "motion_air": lambda: simulate(Scene(Ball(R, 1.0), {}, air=Air(**AIR)), THROW, t1=1.0, motion=Exact()),
     "motion_bump": lambda: simulate(Scene(Ball(R, 1.0), BUMP), THROW, t1=1.0, motion=Exact()),
     "adjoint": lambda: simulate(SCENE, THROW, t1=1.0, adjoint=diffrax.DirectAdjoint()),
