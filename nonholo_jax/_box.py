@@ -14,6 +14,8 @@ from ._surface import AbstractSurface, check, nonzero, positive
 from ._types import Number, Vector3
 from ._vector import (
     add,
+    as_pair,
+    as_quaternion,
     as_vector,
     components,
     cross,
@@ -106,7 +108,7 @@ class Box(AbstractSurface):
     center: Any = eqx.field(converter=as_vector)
     half_size: Any = eqx.field(converter=as_vector)
     law: AbstractContactLaw
-    rotation: Any = eqx.field(converter=as_vector, default=None)
+    rotation: Any = eqx.field(converter=as_quaternion, default=None)
 
     def __check_init__(self):
         check(self)
@@ -157,12 +159,12 @@ class Rectangle(AbstractSurface):
     center: Any = eqx.field(converter=as_vector)
     facing: Any = eqx.field(converter=as_vector)
     tangent: Any = eqx.field(converter=as_vector)
-    half_size: Any = eqx.field(converter=as_vector)
+    half_size: Any = eqx.field(converter=as_pair)
     law: AbstractContactLaw
 
     def __init__(self, center: Any, normal: Any, tangent: Any, half_size: Any, law: AbstractContactLaw):
         self.center, self.facing, self.tangent = as_vector(center), as_vector(normal), as_vector(tangent)
-        self.half_size, self.law = as_vector(half_size), law
+        self.half_size, self.law = as_pair(half_size), law
         check(self)
 
     def _frame(self):

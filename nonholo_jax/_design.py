@@ -129,28 +129,23 @@ def design(
     answer.values                                            # r m v / J, section 5.2.1 of the paper
     ```
     """
-    names = expand(scene, state, free)
-    if not names:
-        raise ValueError("Argument `free` must name at least one number, but got none; try ['spin.y'].")
+    names = _checked_names(scene, state, free, itinerary, goal, n_starts)
     dtype = state.position.dtype
     tolerance = (1e-6 if dtype == jnp.float64 else 1e-3) if tolerance is None else tolerance
-    wanted = _wanted(scene, itinerary)
     times = (jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
     motion, _ = checked(scene, motion, max_impacts, None)
     timed = isinstance(goal, AbstractGoal) and goal.passes_after is not None and not motion.is_closed_form
-    problem = _Problem(scene, state, goal, *times, names, wanted, max_impacts, motion, timed)
+    problem = _Problem(scene, state, goal, *times, names, _wanted(scene, itinerary), max_impacts, motion, timed)
     first = read(scene, state, names)
     chart = _chart(scene, state, names, first, _limits(scene, state, names, bounds or {}, dtype))
-    key = jax.random.key(0) if key is None else key
-    initial = _starts(problem, chart, first, n_starts, key)
+    initial = _starts(problem, chart, first, n_starts, jax.random.key(0) if key is None else key)
     solver = _least_squares_solver(solver)
     begun, found, (miss, met, hit, result, time), steps = _descend(problem, chart, initial, solver, max_steps)
     starts = Starts(begun, found, miss, met, steps, hit, result)
     best = _best(starts, chart, first, tolerance)
     values = starts.found[best]
     scene, state = write(scene, state, names, values)
-    end = time[best] if jnp.isfinite(time[best]) else problem.t1
-    trajectory = problem.trajectory(values, end)  # up to the goal: the picture and the report end there
+    trajectory = _up_to_goal(problem, values, time[best])
     evaluations = n_starts * _CANDIDATES_PER_START + int(jnp.sum(steps))
     return Design(
         state=state,
@@ -166,6 +161,15 @@ def design(
         evaluations=evaluations,
         tolerance=float(tolerance),
     )
+
+
+def _up_to_goal(problem: "_Problem", values: Any, time: Any) -> Trajectory:
+    """The picture and the report end at the goal. Where that is an impact, rounding must not end them before it."""
+    eps = float(jnp.finfo(time.dtype).eps)
+    later = time + 64.0 * eps * (jnp.abs(time) + jnp.abs(problem.t1))
+    is_passage = isinstance(problem.goal, AbstractGoal) and problem.goal.passes_after is not None
+    end = time if is_passage else jnp.minimum(later, problem.t1)
+    return problem.trajectory(values, jnp.where(jnp.isfinite(end), end, problem.t1))
 
 
 class _Problem(eqx.Module):
@@ -283,6 +287,22 @@ def _chart(scene, state, names, first: Any, limits: tuple) -> _Chart:
     sizes = [natural.get(name.rsplit(".", 1)[0], abs(float(x)) or 1.0) for name, x in zip(names, first, strict=True)]
     low, high = limits
     return _Chart(first, jnp.asarray(sizes, dtype=first.dtype), low, high)
+
+
+def _checked_names(scene, state, free, itinerary, goal, n_starts: int) -> tuple[str, ...]:
+    for name, value in (("free", free), ("itinerary", itinerary)):
+        if isinstance(value, str):
+            raise ValueError(f"Argument `{name}` must be a list of names, but got {value!r}; try [{value!r}].")
+    if not callable(goal) and not isinstance(goal, AbstractGoal):
+        raise ValueError(
+            f"Argument `goal` must be a goal or a function of a trajectory, but got {goal!r}; try ReturnTo."
+        )
+    if isinstance(n_starts, bool) or not isinstance(n_starts, int) or n_starts < 1:
+        raise ValueError(f"Argument `n_starts` must be a whole number of at least 1, but got {n_starts!r}; try 16.")
+    names = expand(scene, state, free)
+    if not names:
+        raise ValueError("Argument `free` must name at least one number, but got none; try ['spin.y'].")
+    return names
 
 
 def _wanted(scene: Scene, itinerary: Sequence[str] | None) -> tuple[int, ...] | None:

@@ -19,6 +19,13 @@ _ROUNDS = 3
 _NEWTON_STEPS = 4
 
 
+def _point(x: Any) -> Any:
+    point = jnp.asarray(x, dtype=None if isinstance(x, jax.Array) else float)
+    if point.shape != (3,):
+        raise ValueError(f"Argument `point` must have shape (3,), but got {point.shape}; try [0.0, 0.0, 1.0].")
+    return point
+
+
 class AbstractGoal(eqx.Module):
     """A differentiable residual of a trajectory, zero where the goal is reached.
 
@@ -39,7 +46,7 @@ class ReturnTo(AbstractGoal):
     without an itinerary, on any arc after the first impact. The residual is the vector of closest approach."""
 
     passes_after: ClassVar[int | None] = 1
-    point: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
+    point: Float[Array, "3"] = eqx.field(converter=_point)
 
     def residual(self, trajectory, n_required):
         return _closest_approach(trajectory, self.point, 1 if n_required is None else n_required, n_required is None)
@@ -50,7 +57,7 @@ class HitTarget(AbstractGoal):
     without an itinerary, on any arc, the first included."""
 
     passes_after: ClassVar[int | None] = 0
-    point: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
+    point: Float[Array, "3"] = eqx.field(converter=_point)
 
     def residual(self, trajectory, n_required):
         return _closest_approach(trajectory, self.point, n_required or 0, n_required is None)
@@ -61,7 +68,7 @@ class Land(AbstractGoal):
     itinerary, of the first impact on the surface named `surface` (on any surface if `None`)."""
 
     passes_after: ClassVar[int | None] = None
-    point: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
+    point: Float[Array, "3"] = eqx.field(converter=_point)
     surface: str | None = eqx.field(static=True, default=None)
 
     def residual(self, trajectory, n_required):
@@ -70,6 +77,8 @@ class Land(AbstractGoal):
             row = jnp.asarray(n_required - 1)
         else:
             names = trajectory.system.names  # pyright: ignore[reportAttributeAccessIssue]
+            if self.surface is not None and self.surface not in names:
+                raise ValueError(f"Argument `surface` must be one of {', '.join(names)}, but got {self.surface!r}.")
             wanted = log.surface >= 0 if self.surface is None else log.surface == names.index(self.surface)
             row = jnp.argmax(wanted)
         return log.point[row] - self.point.astype(log.point.dtype), log.time[row]

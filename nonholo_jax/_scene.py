@@ -73,6 +73,12 @@ class Scene(AbstractSystem):
         gravity: Any = (0.0, 0.0, -9.81),
         air: Air | None = None,
     ):
+        if not isinstance(ball, Ball):
+            raise ValueError(f"Argument `ball` must be a Ball, but got {ball!r}; try Ball(radius=0.025, mass=0.046).")
+        if not isinstance(surfaces, Mapping) or not all(isinstance(s, AbstractSurface) for s in surfaces.values()):
+            raise ValueError(
+                f"Argument `surfaces` must map names to surfaces, but got {surfaces!r}; try {{'floor': Plane(...)}}."
+            )
         self.ball = ball
         self.surfaces = tuple(surfaces.values())
         self.names = tuple(surfaces)
@@ -156,7 +162,9 @@ class Scene(AbstractSystem):
         dtype = state.position.dtype
         parts = [components(x.astype(dtype)) for x in (state.position, state.velocity, state.spin)]
         orientation = state.orientation
-        return Flight(*parts, None if orientation is None else orientation.astype(dtype))  # pyright: ignore
+        if orientation is not None:
+            orientation = orientation.astype(dtype) / jnp.linalg.norm(orientation.astype(dtype))
+        return Flight(*parts, orientation)  # pyright: ignore
 
     def packed(self, state: Flight) -> BallState:
         parts = [jnp.stack(x, axis=-1) for x in (state.position, state.velocity, state.spin)]

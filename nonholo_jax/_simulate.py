@@ -8,6 +8,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 
+from ._ball import BallState
 from ._loop import run
 from ._motion import AbstractMotion, Exact
 from ._motion_integrated import Integrated
@@ -87,6 +88,7 @@ def simulate_batch(
 
     - `scene_axes`: as `in_axes` of `vmap`, for scene parameters that are sampled: `None` for one scene for all; 0 if
         every JAX array of the scene has a leading axis N; or a pytree of these in the shape of the scene.
+    - `log_size`: the log of a large batch is most of its memory and time; 0 if only the final states are wanted.
     - `throw`: False by default: one failed lane must not lose a batch. Each lane has its own `Trajectory.result`.
 
     Returns a `Trajectory` with a leading axis N.
@@ -177,6 +179,8 @@ def checked(scene: Any, motion: Any, max_impacts: int, log_size: int | None) -> 
 
 
 def _check_shapes(state: Any, batch: bool) -> None:
+    if not isinstance(state, BallState):
+        raise ValueError(f"Argument `state` must be a BallState, but got {type(state).__name__}; try BallState(...).")
     names = [("position", 3), ("velocity", 3), ("spin", 3), ("orientation", 4)]
     sizes = set()
     for name, n in names:
@@ -199,8 +203,8 @@ def _check_times(t0: Any, t1: Any) -> None:
         raise ValueError(
             f"Arguments `t0` and `t1` must be scalars, but got shapes {t0.shape} and {t1.shape}; try vmap for several."
         )
-    if not any(isinstance(t, jax.core.Tracer) for t in (t0, t1)) and not t1 >= t0:
-        raise ValueError(f"Argument `t1` must be at least `t0`, but got t1={t1} and t0={t0}; try exchanging them.")
+    if not any(isinstance(t, jax.core.Tracer) for t in (t0, t1)) and not (t1 >= t0 and jnp.isfinite(t1 - t0)):
+        raise ValueError(f"Argument `t1` must be finite and at least `t0`, but got t1={t1} and t0={t0}; try t1=1.0.")
 
 
 def _raised(trajectory: Trajectory) -> Trajectory:
@@ -210,10 +214,14 @@ def _raised(trajectory: Trajectory) -> Trajectory:
         return trajectory
     failed = is_failure(trajectory.result)
     if isinstance(code, jax.core.Tracer):
-        return eqx.tree_at(lambda x: x.t1, trajectory, trajectory.result.error_if(trajectory.t1, failed))
+        # On every array of the answer: what is not used is compiled away, and its error with it.
+        answer, rest = eqx.partition((trajectory.final, trajectory.t1, trajectory.impacts), eqx.is_array)
+        final, t1, impacts = eqx.combine(trajectory.result.error_if(answer, failed), rest)
+        return dataclasses.replace(trajectory, final=final, t1=t1, impacts=impacts)
     if failed.ndim == 0 and bool(failed):
         result = trajectory.result
-        raise SimulationError(f"{result_name(result)}: {result_message(result)} (t = {float(trajectory.t1):g} s)")
+        when = "" if isinstance(trajectory.t1, jax.core.Tracer) else f" (t = {float(trajectory.t1):g} s)"
+        raise SimulationError(f"{result_name(result)}: {result_message(result)}{when}")
     if failed.ndim and bool(failed.any()):
         first = int(jnp.argmax(failed))
         result = jax.tree.map(lambda x: x[first], trajectory.result)

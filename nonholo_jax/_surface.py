@@ -35,6 +35,10 @@ class AbstractSurface(eqx.Module):
 
     law: eqx.AbstractVar[AbstractContactLaw]
 
+    def __check_init__(self):
+        if not isinstance(self.law, AbstractContactLaw):
+            raise ValueError(f"Argument `law` must be a contact law, but got {self.law!r}; try Rough(restitution=0.9).")
+
     @abstractmethod
     def distance(self, x: Vector3, t: Number) -> Number:
         """Signed distance of a point from the surface in m."""

@@ -29,8 +29,9 @@ class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
         "`atol`."
     )
     invalid_state = (
-        "The initial state or the scene is not admissible: a value is NaN or infinite, a mass, radius or inertia is "
-        "not positive, or the ball starts inside a surface. Try moving the ball out by at least its radius."
+        "The initial state or the scene is not admissible: a value is NaN or infinite, a mass, radius, inertia or size "
+        "is not positive, a coefficient of restitution or friction is out of its range, a direction has no length, or "
+        "the ball starts inside a surface. Try checking these, and moving the ball out by at least its radius."
     )
     no_limit = (
         "The bounces accumulate without a limit, because the tangential restitution is 1 in size and the normal one "
@@ -42,7 +43,7 @@ class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     )
     sustained_contact = (
         "The ball stays in contact with a surface (it rests, rolls, or its bounces have died out below rounding). "
-        "Try an earlier `t1`, or read `Trajectory.t1` for the time reached."
+        "Try an earlier `t1`, or `throw=False` and `Trajectory.t1` for the time reached."
     )
 
 

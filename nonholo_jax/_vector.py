@@ -23,16 +23,35 @@ def as_number(x: Any) -> Any:
         return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
     if isinstance(x, float | int | np.ndarray | np.generic) and not isinstance(x, bool):
         return float(x)
+    if isinstance(x, str | bool | list | tuple):
+        raise ValueError(f"A number must be a float or a scalar JAX array, but got {x!r}; try 1.0.")
     return x  # a placeholder of a pytree transformation
 
 
-def as_vector(x: Any) -> Any:
-    """A tuple of floats for Python and NumPy vectors; a JAX array of shape (3,) stays as it is."""
+def as_vector(x: Any, n: int = 3) -> Any:
+    """A tuple of n floats for Python and NumPy vectors; a JAX array with last axis n stays as it is."""
+    wrong = f"A vector must have {n} components here, but got {x!r}; try {(0.0,) * (n - 1) + (1.0,)}."
     if isinstance(x, jax.Array):
+        if x.ndim == 0 or x.shape[-1] != n:
+            raise ValueError(wrong)
         return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
     if isinstance(x, list | tuple | np.ndarray):
+        if len(x) != n:
+            raise ValueError(wrong)
         return tuple(as_number(item) for item in x)
+    if isinstance(x, float | int | str):
+        raise ValueError(wrong)
     return x
+
+
+def as_pair(x: Any) -> Any:
+    """`as_vector` of two components."""
+    return as_vector(x, 2)
+
+
+def as_quaternion(x: Any) -> Any:
+    """`as_vector` of four components."""
+    return as_vector(x, 4)
 
 
 def components(x: Any) -> tuple:
