@@ -89,8 +89,8 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, wind
         bends = [times(2.0, p[2]) if len(p) > 2 else 0.0 for p in coefficients]
         speed = norm(here.tangent) + jnp.sqrt(norm(bends) * reach)
         width = jnp.where(speed * left > 2.0 * reach, 2.0 * reach / jnp.where(speed > 0, speed, 1.0), left)
-    if not exact:
-        width = jnp.minimum(width, window)
+    if not exact:  # the reach is a first guess; from then on the window knows better
+        width = jnp.where(jnp.isinf(window), width, jnp.minimum(left, window))
     bend = system.bend(contact, arc.time, Window(coefficients, width))
     m, most = (jnp.asarray(x, dtype=arc.time.dtype) for x in bend)
     value, rate, m, most, width = shared([value, rate, m, most, width], s)
@@ -109,8 +109,8 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, wind
     # One Newton step from here leaves an error of bend (value / rate)^2 / 2: where that is rounding, the zero is found.
     sharpest = jnp.maximum(jnp.abs(m), jnp.abs(most))
     found = (rate < 0) & (sharpest * value * value <= tolerance * rate * rate) & (value <= -rate * width)
-    near = (value <= tolerance) & ((rate < 0) | ((rate == 0) & (m < 0)))
-    last = jnp.where(rate < 0, jnp.minimum(value / _nonzero(-rate), left), 0.0)
+    near = (value <= tolerance) & (((rate < 0) & (zero <= width)) | ((rate == 0) & (m < 0)))
+    last = jnp.where(rate < 0, jnp.minimum(jnp.minimum(value / _nonzero(-rate), zero), left), 0.0)
     hit = near | found
     return _Step(jnp.where(hit, last, jnp.minimum(zero, width)), hit, zero >= width)
 
@@ -171,9 +171,10 @@ def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meet
 
 
 def newton(arc: Arc, s: Scalar, value: Number, rate: Number) -> Scalar:
-    """One Newton step for the zero of a level. Where it does not change (grazing) `s` is kept."""
-    steep = jnp.abs(rate) > float(jnp.finfo(s.dtype).eps) * frozen(norm(arc.tangent(s)))
-    return s - jnp.where(steep, value / jnp.where(steep, rate, 1.0), 0.0)
+    """One Newton step for the zero of a level. Where it hardly changes (grazing) `s` is kept."""
+    steep = jnp.abs(rate) > float(jnp.finfo(s.dtype).eps) ** 0.5 * frozen(norm(arc.tangent(s)))
+    s = s - jnp.where(steep, value / jnp.where(steep, rate, 1.0), 0.0)
+    return s - frozen(jnp.minimum(s, 0.0))  # not before the arc begins, with the derivative it has
 
 
 def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Scalar:

@@ -219,11 +219,14 @@ class _Problem(eqx.Module):
         return self._judged(residual, met, trajectory, time)
 
     def at(self, u: Any, chart: "_Chart") -> tuple[Any, tuple]:
-        """The residual at a point of the chart."""
-        if not self.timed:
-            return self.residual(chart.value(u))
-        time = self.t0 + 0.5 * (self.t1 - self.t0) * (1.0 + jnp.sin(u[-1]))
-        return self.passing(chart.value(u[:-1]), time)
+        """The residual at a point of the chart. The solver works in JAX's default precision, the motion in its own."""
+        wide, u = u.dtype, u.astype(self.t1.dtype)
+        if self.timed:
+            time = self.t0 + 0.5 * (self.t1 - self.t0) * (1.0 + jnp.sin(u[-1]))
+            residual, aside = self.passing(chart.value(u[:-1]), time)
+        else:
+            residual, aside = self.residual(chart.value(u))
+        return residual.astype(wide), aside
 
     def with_time(self, u: Any, time: Any) -> Any:
         """The inverse of what `at` does to the last coordinate, appended to the others."""
@@ -299,6 +302,8 @@ def _checked_names(scene, state, free, itinerary, goal, n_starts: int) -> tuple[
         )
     if isinstance(n_starts, bool) or not isinstance(n_starts, int) or n_starts < 1:
         raise ValueError(f"Argument `n_starts` must be a whole number of at least 1, but got {n_starts!r}; try 16.")
+    if itinerary is not None and len(itinerary) == 0:
+        raise ValueError("Argument `itinerary` must name at least one surface, but got none; try None.")
     names = expand(scene, state, free)
     if not names:
         raise ValueError("Argument `free` must name at least one number, but got none; try ['spin.y'].")
@@ -337,7 +342,7 @@ def _starts(problem: _Problem, chart: _Chart, first: Any, n_starts: int, key: An
     u = jnp.concatenate([chart.coordinate(first)[None], jnp.where(bounded[None], jnp.arcsin(uniform), normal)])
     miss, _, _, _, time = jax.vmap(lambda each: problem.residual(chart.value(each))[1])(u)
     order = jnp.argsort(miss.at[0].set(-1.0))[:n_starts]  # the first guess always takes part
-    return jax.vmap(problem.with_time)(u[order], time[order])
+    return jax.vmap(problem.with_time)(u[order], time[order]).astype(jnp.result_type(float))
 
 
 @eqx.filter_custom_jvp
@@ -369,7 +374,8 @@ def _descend(problem: _Problem, chart: _Chart, initial: Any, solver: Any, max_st
         else:
             solution = optx.minimise(lambda u, _: _loss(u, problem, chart), solver, u, **options)
         d = len(problem.names)
-        return chart.value(u[:d]), chart.value(solution.value[:d]), solution.aux, solution.stats["num_steps"]
+        values = [chart.value(each[:d].astype(problem.t1.dtype)) for each in (u, solution.value)]
+        return *values, solution.aux, solution.stats["num_steps"]
 
     return jax.vmap(one)(initial)
 

@@ -74,14 +74,15 @@ class Land(AbstractGoal):
     def residual(self, trajectory, n_required):
         log = trajectory.impacts
         if n_required is not None:
-            row = jnp.asarray(n_required - 1)
+            row, wanted = jnp.asarray(n_required - 1), None
         else:
             names = trajectory.system.names  # pyright: ignore[reportAttributeAccessIssue]
             if self.surface is not None and self.surface not in names:
                 raise ValueError(f"Argument `surface` must be one of {', '.join(names)}, but got {self.surface!r}.")
             wanted = log.surface >= 0 if self.surface is None else log.surface == names.index(self.surface)
             row = jnp.argmax(wanted)
-        return log.point[row] - self.point.astype(log.point.dtype), log.time[row]
+        happened = log.surface[row] >= 0 if n_required is not None else jnp.any(wanted)
+        return jnp.where(happened, log.point[row] - self.point.astype(log.point.dtype), jnp.nan), log.time[row]
 
 
 def _closest_approach(trajectory: Trajectory, point: Any, first: int, everywhere: bool) -> tuple[Any, Any]:
@@ -109,7 +110,8 @@ def _closest_approach(trajectory: Trajectory, point: Any, first: int, everywhere
         s = frozen(jnp.clip(s - _newton(offset, velocity, bend, s), low, high))
     inside = (s > low) & (s < high)
     s = jnp.where(inside, s - _newton(offset, velocity, bend, s), s)
-    return offset + velocity * s + 0.5 * bend * s * s, frozen(t + s)
+    enough = trajectory.n_impacts >= first
+    return jnp.where(enough, offset + velocity * s + 0.5 * bend * s * s, jnp.nan), frozen(t + s)
 
 
 def _samples(n: int, dtype: Any) -> Any:

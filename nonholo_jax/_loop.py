@@ -254,7 +254,9 @@ def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, path
 
 def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome:
     """Repeat a path with derivatives. What was found (contacts, counts, the result) is taken from `known`."""
-    state = _arrays(state, t0.dtype)
+    moves = known.n_arcs > 0  # a lane that cannot start computes harmless numbers, and gives back what was found
+    state = jax.tree.map(lambda x: jnp.where(moves, x, 0.0), _arrays(state, t0.dtype))
+    t0, t1 = (jnp.where(moves, t, 0.0) for t in (t0, t1))
     _, memory = motion.begin(system, t0, state, t1)
     log_rows = known.log.contact.shape[0]
     reached = known.result == RESULTS.reached_t1
@@ -315,6 +317,7 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
     zero = jnp.asarray(0, dtype=jnp.int32)
     first = (t0, state, memory, jnp.asarray(True), jnp.zeros_like(t0), zero)
     ((time, state, *_), values), _ = lax.scan(chunk, (first, values), steps)
+    time, state = _keep(moves, (time, state), (known.time, known.state))
     return known._replace(time=time, state=state, log=Log(values, known.log.contact))
 
 

@@ -122,7 +122,7 @@ def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any
     values, contact = outcome.log.values, outcome.log.contact
     row = unpack_row(values, outcome.state)
     used = contact >= 0
-    safe = frozen(outcome.state)  # harmless numbers for the rows that are not used
+    safe = jax.tree.map(jnp.nan_to_num, frozen(outcome.state))  # harmless numbers for the rows that are not used
     before = jax.tree.map(lambda a, b: jnp.where(_along(used, a), a, b), row.before, safe)
     if system.n_contacts > 0:
         point, normal = jax.vmap(system.contact_frame)(contact, row.time, before)

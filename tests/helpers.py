@@ -202,7 +202,7 @@ all_surfaces = (
 all_motions = {
     "exact": Exact(),
     "tsit5": Integrated(rtol=1e-10, atol=1e-10),
-    "heun": Integrated(solver=diffrax.Heun(), stepsize_controller=diffrax.ConstantStepSize(), dt0=0.02, max_steps=64),
+    "heun": Integrated(solver=diffrax.Heun(), stepsize_controller=diffrax.ConstantStepSize(), dt0=0.021, max_steps=64),
 }
 
 

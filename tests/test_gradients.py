@@ -98,23 +98,30 @@ def batch_of(case, key, dtype=np.float64):
 
 
 def differences(function, flat, index, step):
-    """Central differences of fourth order, (lanes, outputs, numbers), and whether all points of them share their
-    number of impacts."""
+    """Central differences of fourth order, (lanes, outputs, numbers), and for each lane and number whether all points
+    of them are made of the same number of impacts and steps: the discrete map jumps where a step more is taken."""
     steps = step * np.maximum(np.abs(np.asarray(flat)), 0.1)  # (lanes, numbers)
     shifts = jnp.asarray(np.array([-2, -1, 1, 2])[:, None, None] * np.eye(flat.shape[1]))
 
     @jax.jit
     @jax.vmap
     def around(x, h, i):
-        end = jax.vmap(jax.vmap(lambda d: function(x + d * h, i)))(shifts)
-        return jnp.einsum("s,spo->po", jnp.array([1, -8, 8, -1]) / 12, outputs_of(end)) / h[:, None], end.n_impacts
+        def one(d):
+            trajectory = function(x + d * h, i)
+            return outputs(trajectory), jnp.stack([trajectory.n_impacts, trajectory.n_arcs])
 
-    def outputs_of(end):
-        return jax.vmap(jax.vmap(outputs))(end)
+        end, counts = jax.vmap(jax.vmap(one))(shifts)
+        slopes = jnp.einsum("s,spo->op", jnp.array([1, -8, 8, -1]) / 12, end) / h[None]
+        return slopes, jnp.all(counts == counts[:1], axis=(0, 2))
 
-    slopes, counts = around(flat, jnp.asarray(steps), index)
-    counts = np.asarray(counts).reshape(len(flat), -1)
-    return np.asarray(slopes).transpose(0, 2, 1), np.all(counts == counts[:, :1], axis=1)
+    slopes, same = around(flat, jnp.asarray(steps), index)
+    assert np.mean(same) > 0.9
+    return np.asarray(slopes), np.asarray(same)
+
+
+def check_differences(jacobian, differences, tolerance):
+    slopes, same = differences
+    assert relative(jacobian, np.where(same[:, None, :], slopes, jacobian)) < tolerance
 
 
 def saltation(scene, trajectory, t1):
@@ -163,16 +170,15 @@ def test_modes_agree_with_differences_and_saltation(case, motion, getkey):
     reverse = np.asarray(jax.jit(jax.vmap(jax.jacrev(value)))(flat, index))
     assert np.all(np.isfinite(forward))
     assert relative(forward, reverse) < 1e-10
-    expected, same = differences(function, flat, index, 1e-4)
-    assert same.sum() > 0.8 * len(same)
-    assert relative(forward[same], expected[same]) < 1e-7
+    check_differences(forward, differences(function, flat, index, 1e-4), 1e-7)
     # Every number of the laws counts in some lane, and so do the others, but for the mass and the air in vacuum.
     matters = unravel(jnp.asarray(np.abs(forward).max(axis=(0, 1))))
     unused = {"exact": {"mass", *AIR}, "heun": set()}[motion]
     for group in ("ball", "surface", "air"):
         assert all(np.any(x > 0) for name, x in matters[group].items() if name not in unused)
     idle = {(law, name) for law, group in matters["laws"].items() for name, x in group.items() if x == 0}
-    assert idle == {("frictional_gripping", "friction"), ("frictional_sliding", "tangential")}
+    # Only the coefficient of the branch not taken may be idle; a sliding ball may also grip at a later impact.
+    assert idle <= {("frictional_gripping", "friction"), ("frictional_sliding", "tangential")}
     if motion == "exact":
         check_saltation(case, function, unravel, flat, index, forward)
 
@@ -187,7 +193,7 @@ def check_saltation(case, function, unravel, flat, index, jacobian):
 
     matrices, counts = jax.jit(jax.vmap(expected))(flat, index)
     once = np.asarray(counts) == 1
-    assert once.sum() >= len(all_laws)
+    assert once.sum() >= 2  # inside a round surface most lanes have several impacts, and the formula here is for one
     places = unravel(jnp.arange(flat.shape[1], dtype=float))["state"]
     columns = np.concatenate([np.asarray(places[name], int) for name in ("position", "velocity", "spin")])
     assert relative(jacobian[once][:, :9][:, :, columns], np.asarray(matrices)[once]) < 1e-10
@@ -200,9 +206,7 @@ def test_adaptive_steps_agree_with_differences(getkey):
     flat, index = batch_of(case, getkey())
     value = lambda x, i: outputs(function(x, i))  # noqa: E731
     forward = np.asarray(jax.jit(jax.vmap(jax.jacfwd(value)))(flat, index))
-    expected, same = differences(function, flat, index, 1e-3)
-    assert same.sum() > 0.8 * len(same)
-    assert relative(forward[same], expected[same]) < 1e-5
+    check_differences(forward, differences(function, flat, index, 1e-3), 1e-5)
 
 
 def test_each_law_alone_agrees_with_the_choice_of_laws(getkey):
