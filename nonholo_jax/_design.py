@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
@@ -146,7 +147,7 @@ def design(
     values = starts.found[best]
     scene, state = write(scene, state, names, values)
     trajectory = _up_to_goal(problem, values, time[best])
-    evaluations = n_starts * _CANDIDATES_PER_START + int(jnp.sum(steps))
+    evaluations = n_starts * _CANDIDATES_PER_START + int(np.sum(np.asarray(steps)))
     return Design(
         state=state,
         scene=scene,
@@ -155,7 +156,7 @@ def design(
         loss=0.5 * miss[best] ** 2,
         miss=miss[best],
         converged=bool(met[best] & (miss[best] <= tolerance)),
-        itinerary=tuple(scene.names[int(i)] for i in trajectory.impacts.surface if int(i) >= 0),
+        itinerary=tuple(scene.names[int(i)] for i in np.asarray(trajectory.impacts.surface) if i >= 0),
         trajectory=trajectory,
         starts=starts,
         evaluations=evaluations,
@@ -285,7 +286,7 @@ def _limits(scene, state, names, bounds: Mapping[str, Sequence[float]], dtype) -
 
 def _chart(scene, state, names, first: Any, limits: tuple) -> _Chart:
     """Coordinates in which one is a natural step: a rolling spin for spins, the speed for velocities."""
-    speed = float(jnp.sqrt(jnp.sum(state.velocity**2))) or 1.0
+    speed = float(np.linalg.norm(np.asarray(state.velocity))) or 1.0
     natural = {"throw.velocity": speed, "throw.spin": speed / float(scene.ball.radius), "throw.position": 1.0}
     sizes = [natural.get(name.rsplit(".", 1)[0], abs(float(x)) or 1.0) for name, x in zip(names, first, strict=True)]
     low, high = limits
@@ -381,12 +382,14 @@ def _descend(problem: _Problem, chart: _Chart, initial: Any, solver: Any, max_st
 
 
 def _best(starts: Starts, chart: _Chart, first: Any, tolerance: float) -> int:
-    """Of the starts that reached the goal the one nearest to the first guess; else the closest miss."""
-    reached = starts.met & (starts.miss <= tolerance)
-    distance = jnp.sum(((starts.found - first[None]) / chart.scale[None]) ** 2, axis=-1)
-    if bool(jnp.any(reached)):
-        # Several starts end at one answer up to rounding: take the most exact of those.
-        nearest = jnp.min(jnp.where(reached, distance, jnp.inf))
-        same = reached & (distance <= nearest * (1.0 + 1e-6) + 1e-12)
-        return int(jnp.argmin(jnp.where(same, starts.miss, jnp.inf)))
-    return int(jnp.argmin(starts.miss))
+    """Of the starts that reached the goal the one nearest to the first guess; else the closest miss. In NumPy, since
+    every operation of JAX outside a compiled function is a program of its own to compile."""
+    miss, found = np.asarray(starts.miss), np.asarray(starts.found)
+    reached = np.asarray(starts.met) & (miss <= tolerance)
+    distance = np.sum(((found - np.asarray(first)) / np.asarray(chart.scale)) ** 2, axis=-1)
+    if not np.any(reached):
+        return int(np.argmin(miss))
+    # Several starts end at one answer up to rounding: take the most exact of those.
+    nearest = np.min(np.where(reached, distance, np.inf))
+    same = reached & (distance <= nearest * (1.0 + 1e-6) + 1e-12)
+    return int(np.argmin(np.where(same, miss, np.inf)))

@@ -73,15 +73,14 @@ class Land(AbstractGoal):
 
     def residual(self, trajectory, n_required):
         log = trajectory.impacts
-        if n_required is not None:
-            row, wanted = jnp.asarray(n_required - 1), None
-        else:
-            names = trajectory.system.names  # pyright: ignore[reportAttributeAccessIssue]
-            if self.surface is not None and self.surface not in names:
-                raise ValueError(f"Argument `surface` must be one of {', '.join(names)}, but got {self.surface!r}.")
-            wanted = log.surface >= 0 if self.surface is None else log.surface == names.index(self.surface)
-            row = jnp.argmax(wanted)
-        happened = log.surface[row] >= 0 if n_required is not None else jnp.any(wanted)
+        names = trajectory.system.names  # pyright: ignore[reportAttributeAccessIssue]
+        if self.surface is not None and self.surface not in names:
+            raise ValueError(f"Argument `surface` must be one of {', '.join(names)}, but got {self.surface!r}.")
+        wanted = log.surface >= 0
+        if n_required is None and self.surface is not None:
+            wanted = log.surface == names.index(self.surface)
+        row = jnp.argmax(wanted) if n_required is None else jnp.asarray(n_required - 1)
+        happened = wanted[row]
         return jnp.where(happened, log.point[row] - self.point.astype(log.point.dtype), jnp.nan), log.time[row]
 
 
