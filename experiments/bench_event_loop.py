@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from nonholo_jax import Air, Ball, BallState, Integrated, Plane, Rough, Scene, simulate_batch
+from nonholo_jax import Air, Ball, BallState, Integrated, Plane, Rough, Scene, simulate
 
 jax.config.update("jax_enable_x64", True)
 
@@ -93,10 +93,11 @@ def flat(tolerance: float):
     """This library."""
     motion = Integrated(rtol=tolerance, atol=tolerance)
 
-    def run(states):
-        return simulate_batch(SCENE, states, t1=T1, max_impacts=MAX_BOUNCES, log_size=0, motion=motion).final.position
+    def run(state):
+        options = {"max_impacts": MAX_BOUNCES, "log_size": 0, "throw": False}
+        return simulate(SCENE, state, t1=T1, motion=motion, **options).final.position
 
-    return jax.jit(run)
+    return jax.jit(jax.vmap(run))
 
 
 def seconds(function, states) -> float:

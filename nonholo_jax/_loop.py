@@ -18,6 +18,7 @@ from jax import lax
 from ._crossing import corrected, meeting, newton, search
 from ._motion import AbstractMotion
 from ._system import AbstractSystem
+from ._tiles import in_tiles
 from ._types import RESULTS
 from ._vector import frozen, norm, shared
 
@@ -321,17 +322,22 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
     return known._replace(time=time, state=state, log=Log(values, known.log.contact))
 
 
+def _find(system, motion, state, t0, t1, **options):
+    """`find`, not differentiated, and in tiles where it is batched."""
+    return in_tiles(lambda *primals: find(*primals, **options), motion.tile)(*frozen((system, motion, state, t0, t1)))
+
+
 @eqx.filter_custom_jvp
 def _find_or_replay(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int):
-    outcome, _ = find(system, motion, state, t0, t1, max_impacts=max_impacts, log_rows=log_rows, path_rows=0)
+    outcome, _ = _find(system, motion, state, t0, t1, max_impacts=max_impacts, log_rows=log_rows, path_rows=0)
     return outcome
 
 
 @_find_or_replay.def_jvp
 def _find_or_replay_jvp(primals, tangents, *, max_impacts: int, log_rows: int):
     _, motion, *_ = primals
-    outcome, path = find(*primals, max_impacts=max_impacts, log_rows=log_rows, path_rows=motion.max_pieces(max_impacts))
-    outcome, path = frozen((outcome, path))
+    path_rows = motion.max_pieces(max_impacts)
+    outcome, path = _find(*primals, max_impacts=max_impacts, log_rows=log_rows, path_rows=path_rows)
     repeat = lambda system, motion, state, t0, t1: replay(system, motion, state, t0, t1, path, outcome)  # noqa: E731
     return eqx.filter_jvp(repeat, primals, tangents)
 

@@ -23,9 +23,11 @@ class Piece(NamedTuple):
 
 class AbstractMotion(eqx.Module):
     """Makes the arcs of a system. `safe_steps` is how many steps of the search for a crossing one turn of the loop
-    takes; `is_closed_form` says that one piece reaches any time."""
+    takes; `tile` is how many lanes of a batch share one loop on a CPU; `is_closed_form` says that one piece reaches any
+    time."""
 
     safe_steps: eqx.AbstractVar[int]
+    tile: eqx.AbstractVar[int]
     is_closed_form: eqx.AbstractClassVar[bool]
 
     @abstractmethod
@@ -71,6 +73,7 @@ class Exact(AbstractMotion):
     """
 
     safe_steps: int = eqx.field(static=True, default=1)
+    tile: int = eqx.field(static=True, default=256)
     is_closed_form: ClassVar[bool] = True
 
     def check(self, system):

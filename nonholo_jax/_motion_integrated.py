@@ -53,7 +53,8 @@ class Integrated(AbstractMotion):
     atol: float = eqx.field(static=True, default=1e-8)
     dt0: Any = None
     max_steps: int = eqx.field(static=True, default=4096)
-    safe_steps: int = eqx.field(static=True, default=8)
+    safe_steps: int = eqx.field(static=True, default=3)
+    tile: int = eqx.field(static=True, default=64)
     is_closed_form: ClassVar[bool] = False
 
     def __check_init__(self):

@@ -14,6 +14,7 @@ ORDER = [
     "_vector",
     "_polynomial",
     "_rotation",
+    "_tiles",
     # ground: the mathematics of impact
     "_impact",
     "_law",
