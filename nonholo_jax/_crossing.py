@@ -15,9 +15,10 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from ._polynomial import Polynomial, Window, derivative, evaluate, recentred
+from ._shared import shared
 from ._system import AbstractSystem, rounding
 from ._types import Index, Number, Scalar
-from ._vector import frozen, norm, select, shared, slope, times
+from ._vector import frozen, norm, select, slope, times
 
 
 class Arc(eqx.Module):
@@ -93,7 +94,7 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, wind
         width = jnp.where(jnp.isinf(window), width, jnp.minimum(left, window))
     bend = system.bend(contact, arc.time, Window(coefficients, width))
     m, most = (jnp.asarray(x, dtype=arc.time.dtype) for x in bend)
-    value, rate, m, most, width = shared([value, rate, m, most, width], s)
+    value, rate, m, most, width = shared([value, rate, m, most, width])
 
     # A contact that has just been left has a gap of exactly zero that does not close; rounding may not say otherwise.
     left_behind = touching & (s == 0)
@@ -166,7 +167,7 @@ def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meet
         value, rate = slope(lambda x, i=i: system.level(i, arc.time, x), here.position, here.tangent)
         bend = system.bend(i, arc.time, Window(here.coefficients, 0.0))
         columns.append((value, rate, bend.low, rounding(system, i, here.size)))
-    value, rate, bend, tolerance = shared([select(contact, column) for column in zip(*columns, strict=True)], s)
+    value, rate, bend, tolerance = shared([select(contact, column) for column in zip(*columns, strict=True)])
     return Meeting(value, rate, (bend < 0) & (rate * rate <= -2.0 * bend * tolerance))  # pyright: ignore
 
 
@@ -184,5 +185,5 @@ def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Sc
     for _ in range(2):
         q, tangent = arc.position(s), arc.tangent(s)
         pairs = [slope(lambda x, i=i: system.level(i, arc.time, x), q, tangent) for i in range(system.n_contacts)]
-        s = newton(arc, s, *(select(contact, column) for column in zip(*pairs, strict=True)))
+        (s,) = shared([newton(arc, s, *(select(contact, column) for column in zip(*pairs, strict=True)))])
     return s

@@ -17,10 +17,11 @@ from jax import lax
 
 from ._crossing import corrected, meeting, newton, search
 from ._motion import AbstractMotion
+from ._shared import shared
 from ._system import AbstractSystem
 from ._tiles import in_tiles
 from ._types import RESULTS
-from ._vector import frozen, norm, shared
+from ._vector import frozen, norm
 
 _CHUNK = 16
 _MOST_IMPACTS_AT_ONCE = 32
@@ -43,7 +44,8 @@ class Log(NamedTuple):
 
 
 class Path(NamedTuple):
-    """What `replay` needs of every arc: its size in seconds, where it was cut in local time, and by which contact."""
+    """What `replay` needs of every arc: its size in seconds (infinite for one that reaches as far as t1, whose size
+    has derivatives), where it was cut in local time, and by which contact."""
 
     sizes: Any
     contact: Any
@@ -116,13 +118,13 @@ def _write(buffer: Any, index: Any, wanted: Any, value: Any) -> Any:
     return buffer.at[jnp.where(wanted, index, rows)].set(value, mode="drop")
 
 
-def _shared(state: Any, finite: Any) -> Any:
+def _shared(state: Any) -> Any:
     leaves, treedef = jax.tree.flatten(state)
-    return jax.tree.unflatten(treedef, shared(leaves, finite))
+    return jax.tree.unflatten(treedef, shared(leaves))
 
 
-def _shared_flags(flags: tuple, finite: Any) -> list:
-    return [flag > 0.5 for flag in shared([flag.astype(finite.dtype) for flag in flags], finite)]
+def _shared_flags(flags: tuple) -> list:
+    return [flag > 0.5 for flag in shared([flag.astype(float) for flag in flags])]
 
 
 def _keep(condition: Any, new: Any, old: Any) -> Any:
@@ -165,7 +167,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     arc = piece.arc
     kept, control = motion.judge(c.control, size, piece.trial)
     found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
-    kept, finished = _shared_flags((kept, found.finished), c.since)
+    kept, finished = _shared_flags((kept, found.finished))
     ended = kept & finished
     crossed = ended & (found.contact >= 0)
     through = ended & ~crossed
@@ -173,12 +175,12 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     if system.n_contacts > 0:
         met = meeting(system, arc, found.s, found.contact)
         s, resting = jnp.where(crossed, newton(arc, s, met.value, met.rate), s), met.rests
-        (s,) = shared([s], c.since)
+        (s,) = shared([s])
     elapsed = s * arc.unit
     reached = through & last
     time = jnp.where(reached, t1, c.time + elapsed)
     arrived = _arrays(system.advanced(c.state, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
-    arrived = _shared(arrived, c.since)
+    arrived = _shared(arrived)
 
     since = c.since + elapsed
     at_once = since * norm(frozen(arc.velocity(s))) <= _tiny(system, arc, s)
@@ -186,7 +188,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     full = c.n_impacts >= max_impacts
     stuck = n_at_once > _MOST_IMPACTS_AT_ONCE
     stopped = crossed & (resting | full | stuck)
-    stopped, crossed = _shared_flags((stopped, crossed), c.since)
+    stopped, crossed = _shared_flags((stopped, crossed))
     struck = crossed & ~stopped
     after = _arrays(system.impact(found.contact, time, arrived), t1.dtype) if system.n_contacts > 0 else arrived
     row = pack_row(Row(time, since, arrived, after))
@@ -195,7 +197,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
         _write(c.log.contact, c.n_impacts, struck & ~c.done, found.contact),
     )
     path = Path(
-        _write(c.path.sizes, c.n_arcs, ended & ~c.done, frozen(jnp.stack([length, s]))),
+        _write(c.path.sizes, c.n_arcs, ended & ~c.done, frozen(jnp.stack([jnp.where(last, jnp.inf, length), s]))),
         _write(c.path.contact, c.n_arcs, ended & ~c.done, found.contact),
     )
 
@@ -203,7 +205,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     result = RESULTS.where(crossed & stuck, RESULTS.corner, result)
     result = RESULTS.where(crossed & resting, RESULTS.sustained_contact, result)
     broken = ended & ~jnp.isfinite(time + sum(arrived_leaf.sum() for arrived_leaf in jax.tree.leaves(arrived)))
-    (broken,) = _shared_flags((broken,), c.since)
+    (broken,) = _shared_flags((broken,))
     result = RESULTS.where(broken, RESULTS.invalid_state, result)
     exhausted = (c.n_turns + 1 >= motion.max_turns(max_impacts)) & ~(reached | stopped | broken)
     result = RESULTS.where(exhausted, RESULTS.step_limit, result)
@@ -268,17 +270,16 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         used = index < known.n_arcs
         last = reached & (index == known.n_arcs - 1)
         left = t1 - time
-        # A path without impacts since its last full step ends at t1 exactly, wherever its impacts move to.
-        whole = jnp.where(used, jnp.where(last | motion.is_closed_form, left, size), 0.0)
+        whole = jnp.where(used, jnp.where(jnp.isinf(size), left, size), 0.0)
         piece = motion.piece(system, time, state, memory, jumped, whole)
         arc = piece.arc
         crossed = used & (contact >= 0)
         if system.n_contacts > 0:
-            (s,) = shared([jnp.where(crossed, corrected(system, arc, s, contact), s)], time)
+            (s,) = shared([jnp.where(crossed, corrected(system, arc, s, contact), s)])
         s = jnp.where(last, arc.length, s)
         s = jnp.where(used, s, 0.0)
         elapsed = s * arc.unit
-        arrived = _shared(_arrays(system.advanced(state, arc.position(s), arc.velocity(s), elapsed), t1.dtype), time)
+        arrived = _shared(_arrays(system.advanced(state, arc.position(s), arc.velocity(s), elapsed), t1.dtype))
         moved = jnp.where(last, t1, time + elapsed)
         struck = crossed & (n_impacts < known.n_impacts)
         after = arrived

@@ -10,8 +10,9 @@ import numpy as np
 
 from ._crossing import Arc
 from ._motion import AbstractMotion, Piece
+from ._shared import shared
 from ._types import Scalar
-from ._vector import frozen, plus, root, shared, times, total
+from ._vector import frozen, plus, root, times, total
 
 
 def _rms(tree: Any) -> Any:
@@ -162,27 +163,43 @@ def _unrolled_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -> P
     """One step of an explicit Runge-Kutta method, stage by stage over scalars, and its interpolant."""
     tableau, (q, v) = solver.tableau, system.evolving(state)
     n = len(q)
-    stages = []  # h times the derivative of (q, v), flat
+    stages, rates = [], []  # h times the derivative of (q, v), flat; dq/dt itself
     for i in range(tableau.num_stages):
         row = tableau.a_lower[i - 1] if i > 0 else ()
         z = [plus(x, _combination(row, [k[j] for k in stages])) for j, x in enumerate((*q, *v))]
         c = 0.0 if i == 0 else float(tableau.c[i - 1])
         a = system.acceleration(time + c * h, state, tuple(z[:n]), tuple(z[n:]))
-        stages.append(shared([h * x for x in (*z[n:], *a)], h))
+        stages.append(shared([h * x for x in (*z[n:], *a)]))
+        rates.append(z[n:])
     z0 = (*q, *v)
     columns = [[k[j] for k in stages] for j in range(2 * n)]
-    steps = shared([_combination(tableau.b_sol, column) for column in columns], h)
+    steps = shared([_combination(tableau.b_sol, column) for column in columns])
     z1 = tuple(plus(x, step) for x, step in zip(z0, steps, strict=True))
     error = tuple(_combination(tableau.b_error, column) for column in columns)
     weights = interpolation_weights(solver)
+    if len(weights) == 2 and not tableau.fsal:
+        means = [_combination(tableau.b_sol, column) for column in zip(*rates, strict=True)]
+        path = [_hermite(*ends, h) for ends in zip(q, v, z1[n:], means, strict=True)]
+        arc = Arc(time, tuple(p for p, _ in path), tuple(r for _, r in path), jnp.ones_like(h), h)
+        return Piece(arc, None, (z0, z1, error))
     polynomials = []
     for x, step, column in zip(z0, steps, columns, strict=True):
-        inner = shared([_combination(row, column) for row in weights], h)
+        inner = shared([_combination(row, column) for row in weights])
         # The last coefficient makes the polynomial end where the step ends, to rounding.
         polynomials.append((x, *inner, plus(step, times(-1.0, total(inner)))))
     one = jnp.ones_like(h)
     arc = Arc(time, tuple(polynomials[:n]), tuple(polynomials[n:]), one, h)
     return Piece(arc, None, (z0, z1, error))
+
+
+def _hermite(q0: Any, v0: Any, v1: Any, mean: Any, h: Any) -> tuple[tuple, tuple]:
+    """The cubic with the velocities v0 and v1 at its ends and `mean` between them, and its rate. Diffrax's own cubic
+    takes the last stage for the slope at the end, which it is not where the first stage is not the last of the step
+    before: a ball would leave the floor with another velocity than it has there."""
+    second = plus(times(3.0, mean), times(-1.0, plus(times(2.0, v0), v1)))
+    third = plus(plus(v0, v1), times(-2.0, mean))
+    second, third = shared([second, third])
+    return (q0, times(h, v0), times(h, second), times(h, third)), (v0, times(2.0, second), times(3.0, third))
 
 
 def interpolation_weights(solver: Any) -> np.ndarray:

@@ -11,6 +11,7 @@ from ._air import Air
 from ._ball import Ball, BallState
 from ._polynomial import Window
 from ._rotation import turned
+from ._shared import shared
 from ._surface import AbstractSurface
 from ._system import AbstractSystem, rounding
 from ._types import Vector3
@@ -25,7 +26,6 @@ from ._vector import (
     scale,
     select,
     select_vector,
-    shared,
     subtract,
     times,
 )
@@ -119,15 +119,16 @@ class Scene(AbstractSystem):
     def impact(self, contact, time, state):
         """Theorem 5.2 for any normal and any law."""
         ball, x = self.ball, state.position
-        n = select_vector(contact, [surface.direction(x, time) for surface in self.surfaces])
+        n = shared(select_vector(contact, [surface.direction(x, time) for surface in self.surfaces]))
         e_n = select(contact, [surface.law.restitution for surface in self.surfaces])
         closing = dot(n, state.velocity)
         contact_velocity = subtract(state.velocity, scale(ball.radius, cross(state.spin, n)))
         slip = subtract(contact_velocity, scale(closing, n))
-        closing, *slip = shared([closing, *slip], time)
+        closing, *slip = shared([closing, *slip])
         sizes = (ball.inertia_ratio, abs(closing), dot(slip, slip))
         s = select(contact, [surface.law.slip_factor(*sizes) for surface in self.surfaces])
-        kick = add(scale(times(plus(1.0, e_n), closing), n), scale(s, slip))
+        s, rebound = shared([s, times(plus(1.0, e_n), closing)])
+        kick = add(scale(rebound, n), scale(s, slip))
         twist = times(s, ratio(1.0, times(ball.inertia_ratio, ball.radius)))
         spin = add(state.spin, scale(twist, cross(n, tuple(slip))))
         return Flight(x, subtract(state.velocity, kick), spin, state.orientation)

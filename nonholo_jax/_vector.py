@@ -180,11 +180,3 @@ def slope(function: Callable, at: Sequence, along: Sequence) -> tuple[Number, Nu
 def frozen(tree: Any) -> Any:
     """The same values without derivatives; constants stay constants."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, tree)
-
-
-def shared(values: Sequence[Any], finite: Any) -> list:
-    """The same numbers, computed once. XLA's fusion on the CPU copies whatever is cheap into all of its consumers, and
-    their consumers, so that a chain of stages is recomputed for every output; a division it never copies. So divide by
-    a one that it cannot see through; `finite` is any traced finite number."""
-    one = 1.0 + 0.0 * frozen(finite)
-    return [value if is_constant(value) else value / one for value in values]

@@ -49,7 +49,7 @@ all_laws = (
     LawCase("rough_two_coefficients", Rough, {"restitution": 0.9, "tangential": 0.5}),
     LawCase("smooth", Smooth, {"restitution": 0.85}),
     LawCase("frictional_gripping", Frictional, {"restitution": 0.8, "tangential": 0.3, "friction": 50.0}),
-    LawCase("frictional_sliding", Frictional, {"restitution": 0.8, "tangential": 0.3, "friction": 0.02}),
+    LawCase("frictional_sliding", Frictional, {"restitution": 0.8, "tangential": 0.3, "friction": 0.002}),
 )
 
 

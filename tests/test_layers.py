@@ -12,6 +12,7 @@ PACKAGE = pathlib.Path(nonholo_jax.__file__).parent
 ORDER = [
     "_types",
     "_vector",
+    "_shared",
     "_polynomial",
     "_rotation",
     "_tiles",
