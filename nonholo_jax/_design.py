@@ -91,7 +91,7 @@ def design(
     free: Sequence[str],
     goal: AbstractGoal | Callable[[Trajectory], Any],
     itinerary: Sequence[str] | None = None,
-    bounds: Mapping[str, Sequence[float]] | None = None,
+    bounds: Mapping[str, Sequence[float | int]] | None = None,
     n_starts: int = 16,
     key: Any = None,
     t1: Any,
@@ -268,7 +268,7 @@ class _Chart(eqx.Module):
         return jnp.where(below & above, two_sided, jnp.where(below | above, one_sided, (x - self.centre) / self.scale))
 
 
-def _limits(scene, state, names, bounds: Mapping[str, Sequence[float]], dtype) -> tuple[Array, Array]:
+def _limits(scene, state, names, bounds: Mapping[str, Sequence[float | int]], dtype) -> tuple[Array, Array]:
     low, high = [-jnp.inf] * len(names), [jnp.inf] * len(names)
     for name, pair in bounds.items():
         for full in expand(scene, state, [name]):
