@@ -43,7 +43,14 @@ class AbstractGoal(eqx.Module):
 
 class ReturnTo(AbstractGoal):
     """The ball's centre comes back to `point` (in m, shape (3,)) on the arc after the itinerary's last impact, or,
-    without an itinerary, on any arc after the first impact. The residual is the vector of closest approach."""
+    without an itinerary, on any arc after the first impact. The residual is the vector of closest approach. Raises
+    `ValueError` for another shape.
+
+    ```python
+    from nonholo_jax import ReturnTo
+    goal = ReturnTo([-0.3, 0.0, 0.9])
+    ```
+    """
 
     passes_after: ClassVar[int | None] = 1
     point: Float[Array, "3"] = eqx.field(converter=_point)
@@ -54,7 +61,13 @@ class ReturnTo(AbstractGoal):
 
 class HitTarget(AbstractGoal):
     """The ball's centre passes through `point` (in m, shape (3,)) on the arc after the itinerary's last impact, or,
-    without an itinerary, on any arc, the first included."""
+    without an itinerary, on any arc, the first included. Raises `ValueError` for another shape.
+
+    ```python
+    from nonholo_jax import HitTarget
+    goal = HitTarget([1.2, 0.0, 0.4])
+    ```
+    """
 
     passes_after: ClassVar[int | None] = 0
     point: Float[Array, "3"] = eqx.field(converter=_point)
@@ -65,7 +78,14 @@ class HitTarget(AbstractGoal):
 
 class Land(AbstractGoal):
     """The contact point of an impact is at `point` (in m, shape (3,)): of the itinerary's last impact, or, without an
-    itinerary, of the first impact on the surface named `surface` (on any surface if `None`)."""
+    itinerary, of the first impact on the surface named `surface` (on any surface if `None`). Raises `ValueError` for
+    another shape, and when it is asked about a scene without that surface.
+
+    ```python
+    from nonholo_jax import Land
+    goal = Land([0.5, 0.1, 0.0], surface="floor")
+    ```
+    """
 
     passes_after: ClassVar[int | None] = None
     point: Float[Array, "3"] = eqx.field(converter=_point)

@@ -1,5 +1,6 @@
 """Motion by any explicit Diffrax solver, one step an arc, with the solver's own interpolant."""
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -155,7 +156,7 @@ def _term(system: Any, state: Any) -> diffrax.ODETerm:
     return diffrax.ODETerm(field)
 
 
-def _combination(weights: Any, terms: list) -> Any:
+def _combination(weights: Any, terms: Sequence) -> Any:
     return total([times(float(w), term) for w, term in zip(weights, terms, strict=False)])
 
 

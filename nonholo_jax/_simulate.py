@@ -16,6 +16,8 @@ from ._system import AbstractSystem
 from ._trajectory import Trajectory, packaged
 from ._types import is_failure, result_message, result_name
 
+_VECTORS = ("point", "facing", "tangent", "center", "half_size", "rotation", "axis", "gravity", "wind")
+
 
 class SimulationError(RuntimeError):
     """A motion could not be computed; the message is that of its result."""
@@ -65,6 +67,7 @@ def simulate(
     dtype = jax.tree.leaves(state)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)
+    _check_scene(scene, _axes(scene, None))
     trajectory = _run(scene, motion, state, t0, t1, max_impacts, log_rows, adjoint)
     return _raised(trajectory) if throw else trajectory
 
@@ -107,8 +110,26 @@ def simulate_batch(
     dtype = jax.tree.leaves(states)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)
+    _check_scene(scene, _axes(scene, scene_axes))
     trajectory = _run_batch(scene, motion, states, t0, t1, scene_axes, max_impacts, log_rows, adjoint)
     return _raised(trajectory) if throw else trajectory
+
+
+def _check_scene(scene: Any, axes: list) -> None:
+    """Every number of a scene is one number, and every vector one vector, but for the axis that is mapped."""
+    leaves = jax.tree_util.tree_flatten_with_path(scene)[0]
+    for (path, leaf), axis in zip(leaves, axes, strict=True):
+        fields = [key.name for key in path if isinstance(key, jax.tree_util.GetAttrKey)]
+        if not eqx.is_array(leaf) or "function" in fields:  # the numbers of a gap function are its own affair
+            continue
+        own = leaf.shape if axis is None else leaf.shape[:axis] + leaf.shape[axis:][1:]
+        whole = isinstance(path[-1], jax.tree_util.GetAttrKey) and fields[-1] in _VECTORS  # else one of its components
+        if len(own) != whole:
+            what = jax.tree_util.keystr(path, simple=True, separator=".")
+            raise ValueError(
+                f"Argument `scene` must hold one value per motion in `{what}`, but got an array of shape {leaf.shape}; "
+                "try simulate_batch(..., scene_axes=0), or vmap, for many scenes."
+            )
 
 
 @eqx.filter_jit

@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
@@ -64,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     what = "Rough balls that fly and bounce: simulate a throw, or design one."
     codes = "Exit code: 0 done, 2 bad input, 3 the computation failed."
     parser = _Parser("nonholo", description=what, epilog=codes, allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"nonholo_jax {metadata.version('nonholo_jax')}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     for verb, purpose in (
         ("simulate", "simulate the throw of a scene file"),
@@ -94,6 +96,8 @@ def _run(options: argparse.Namespace, from_start: bool) -> int:
                 raise _BadInput(f"{options.scene}: {what}; add [{table}] with {example}")
         folder = None if options.no_plot else _writable(options.out, options.scene)
         clock = _CompileClock()
+        if sys.stderr.isatty():
+            print(f"nonholo: compiling the {options.verb}; this takes most of the time", file=sys.stderr, flush=True)
         try:
             answer = {"simulate": _simulate, "design": _design}[options.verb](file)
         except ValueError as error:  # arguments that only the computation itself can judge
@@ -298,8 +302,8 @@ def _design(file: Any) -> _Answer:
             f"{answer.miss:.3g} m; widen `design.bounds`, free more, raise `n_starts`, or change the itinerary"
         )
     goal = file.design.goal
-    hand = goal.point if type(goal).__name__ == "ReturnTo" else None
-    return _Answer(report, text, answer.trajectory, {"hand": hand}, failure)
+    drawing = {"hand" if type(goal).__name__ == "ReturnTo" else "target": goal.point}
+    return _Answer(report, text, answer.trajectory, drawing, failure)
 
 
 # Printing

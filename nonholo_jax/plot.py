@@ -225,8 +225,8 @@ def _draw_impacts(panel: Panel, strikes: Strikes, colour: Any, radius: float, fa
         panel.place(_counted(place), around, cost, True, fontweight="bold", gid="number")
 
 
-def _draw_start(panel: Panel, samples: Samples, colour: Any, radius: float, hand: Any, named: bool) -> None:
-    """The ball as it is thrown, its velocity, and the hand; with labels where `named`."""
+def _draw_start(panel: Panel, samples: Samples, colour: Any, radius: float, marks: dict, named: bool) -> None:
+    """The ball as it is thrown, its velocity, and points marked by name; with labels where `named`."""
     from matplotlib.patches import Circle, FancyArrowPatch
     from matplotlib.patheffects import Normal, withStroke
 
@@ -243,13 +243,13 @@ def _draw_start(panel: Panel, samples: Samples, colour: Any, radius: float, hand
         arrow.set_path_effects([withStroke(linewidth=2.4, foreground="white"), Normal()])
         panel.ax.add_patch(arrow)
         panel.keep_clear(np.stack([center, tip]))
-    if hand is not None:
-        at = panel.view.flat(hand)
-        panel.ax.plot(*at, "*", ms=10, mfc="#E69F00", mec=_INK, mew=0.7, zorder=8, gid="hand")
+    for name, place in marks.items():
+        at = panel.view.flat(place)
+        panel.ax.plot(*at, "*", ms=10, mfc="#E69F00", mec=_INK, mew=0.7, zorder=8, gid=name)
         panel.crowd.append(at + 5 * point * _ring(np.linspace(0, 2 * np.pi, 8)))
-    if hand is not None and named:
-        around, cost = _around(panel.view.flat(hand), [radius + gap * point for gap in (9, 13, 18, 26, 36)], np.pi)
-        panel.place("hand", around, cost, fontsize=9, gid="hand-label")
+        if named:
+            around, cost = _around(at, [radius + gap * point for gap in (9, 13, 18, 26, 36)], np.pi)
+            panel.place(name, around, cost, fontsize=9, gid=f"{name}-label")
     if speed > 1e-9 and named:
         full = float(np.linalg.norm(samples.velocity[0]))
         around, cost = _around(tip, [gap * point for gap in (16, 22, 30, 40)], np.arctan2(*velocity[::-1]))
@@ -423,6 +423,7 @@ def plot_trajectory(
     trajectory: Any,
     *,
     hand: Any = None,
+    target: Any = None,
     title: str | None = None,
     path: str | Path | None = None,
     until: float | None = None,
@@ -432,7 +433,7 @@ def plot_trajectory(
     **Arguments:**
 
     - `scene`: a `Scene`, and `trajectory`: what `simulate` made of it, with a log.
-    - `hand`: a point to mark, in m, shape (3,); `None` for no mark.
+    - `hand`, `target`: points to mark, in m, shape (3,); `None` for no mark.
     - `title`: `None` for the itinerary. How the motion ended is added unless it did all that was asked of it.
     - `path`: where to write a PNG of 150 dots per inch; `None` to write nothing.
     - `until`: the picture ends at this time in s, or where the motion or its log ends if that is earlier.
@@ -458,7 +459,8 @@ def plot_trajectory(
     samples, strikes = sample(trajectory, end)
     view, above = views(scene, samples.position)
     radius = float(scene.ball.radius)
-    marked = samples.position if hand is None else np.vstack([samples.position, as_numpy(hand)])
+    marks = {name: as_numpy(at) for name, at in (("hand", hand), ("target", target)) if at is not None}
+    marked = np.vstack([samples.position, *marks.values()])
     low, high = _widened(scene, view, *_bounds(view, marked, radius), strikes)
     back, front = _bounds(above, marked, radius)
     back[0], front[0] = low[0], high[0]
@@ -478,7 +480,7 @@ def plot_trajectory(
         names = _draw_room(panel, scene)
         _draw_path(panel, samples, colour)
         _draw_impacts(panel, strikes, colour, drawn, max(fastest, 1e-9))
-        _draw_start(panel, samples, colour, drawn, hand, panel is panels[0])
+        _draw_start(panel, samples, colour, drawn, marks, panel is panels[0])
         for name, places in names:
             panel.place(name, places, 0.1 * np.arange(len(places)), fontstyle="italic", color=_INK, gid="surface")
     energy = _axes(figure, page, page.energy)

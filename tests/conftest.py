@@ -18,6 +18,13 @@ def pytest_configure(config):
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _forget_programs():
+    """Each compiled program holds memory maps, of which a process may have 65,530: let go of those of each file."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def getkey():
     """`getkey()` is a new random key at every call, the same ones in every run."""

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -355,6 +356,11 @@ def test_design_without_an_answer_is_exit_code_3_with_an_honest_report(tmp_path,
     out, err = capsys.readouterr()
     assert "not found" in out and out.count("came no closer than") == 2
     assert err.count("\n") == 1 and "missed by" in err and "widen" in err
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert re.fullmatch(r"nonholo_jax \d+\.\d+\.\d+\n", capsys.readouterr().out)
 
 
 def test_help_is_exit_code_0(capsys):

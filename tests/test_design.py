@@ -10,7 +10,6 @@ import optax
 import pytest
 
 from nonholo_jax import (
-    Air,
     Ball,
     BallState,
     HitTarget,
@@ -34,10 +33,10 @@ FALL = (np.sqrt(2.0**2 + 2 * G * (1 - R)) - 2.0) / G  # of a throw downwards wit
 THROW = BallState(START, [1.0, 0.0, -2.0], [0.0, 0.0, 0.0])
 
 
-def room(law=None, *, ball=None, air=None):
+def room(law=None, *, ball=None):
     floor = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Rough() if law is None else law)
     ceiling = Plane((0.0, 0.0, 3.0), (0.0, 0.0, -1.0), Rough())
-    return Scene(Ball(R, 0.046) if ball is None else ball, {"floor": floor, "ceiling": ceiling}, air=air)
+    return Scene(Ball(R, 0.046) if ball is None else ball, {"floor": floor, "ceiling": ceiling})
 
 
 # Closed forms
@@ -109,18 +108,6 @@ def test_single_precision():
     answer = design(room(), throw, free=["spin.y"], goal=ReturnTo(START), itinerary=["floor"], t1=0.8, n_starts=2)
     assert answer.converged and answer.values.dtype == jnp.float32 and answer.miss < 1e-5
     np.testing.assert_allclose(answer.values, [-1 / (0.4 * R)], rtol=1e-5)
-
-
-def test_air(getkey):
-    """With air there is no closed form: the answer, moved again with other steps, passes through the goal."""
-    scene = room(Rough(0.9, 0.5), air=Air())
-    answer = design(
-        scene, THROW, free=["spin.y", "velocity.z"], goal=ReturnTo(START), itinerary=["floor"], t1=2.0, n_starts=8,
-        key=getkey(), bounds={"velocity.z": [-8.0, 0.0]}, motion=Integrated(rtol=1e-9, atol=1e-9),
-    )  # fmt: skip
-    assert answer.converged and answer.itinerary == ("floor",)
-    again = simulate(scene, answer.state, t1=answer.trajectory.t1, motion=Integrated(rtol=1e-11, atol=1e-11))
-    assert jnp.linalg.norm(again.final.position - jnp.asarray(START)) < 1e-6
 
 
 # No answer

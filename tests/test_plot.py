@@ -239,6 +239,14 @@ def test_the_path_has_a_sharp_kink_at_every_impact():
         assert np.linalg.norm(points - center, axis=1).min() < 1e-12
 
 
+def test_hand_and_target_are_marked_where_they_are():
+    scene, trajectory, _ = _drawn("table")
+    figure = plot_trajectory(scene, trajectory, hand=(-0.3, 0.0, 0.9), target=(0.4, 0.0, 0.5))
+    stars = {line.get_gid(): line.get_xydata()[0] for line in _side(figure).lines if line.get_marker() == "*"}
+    assert set(stars) == {"hand", "target"} and np.allclose(stars["target"] - stars["hand"], [0.7, -0.4])
+    assert {"hand", "target"} <= {text.get_text() for text in _side(figure).texts}
+
+
 def test_until_ends_the_picture():
     _, trajectory, figure = _drawn("table", until=0.3)
     (line,) = figure.findobj(lambda a: a.get_gid() == "energy-total")

@@ -245,6 +245,17 @@ def test_scene_axes(axes):
         np.testing.assert_allclose(half, stacked(one.at(0.7)), rtol=0, atol=1e-12)
 
 
+def test_many_scenes_without_an_axis_are_named():
+    scene = scene_with(jnp.linspace(0.75, 0.9, 4))
+    with pytest.raises(ValueError, match=r"surfaces.0.law.restitution.*\(4,\).*scene_axes=0"):
+        simulate_batch(scene, sampled(4), t1=1.5)
+    with pytest.raises(ValueError, match=r"\(4,\).*vmap"):
+        simulate(scene, THROW, t1=1.5)
+    pairs = eqx.tree_at(lambda s: s.surfaces[0].point, scene_with(0.8), jnp.zeros((4, 3)))
+    with pytest.raises(ValueError, match=r"surfaces.0.point.*\(4, 3\)"):
+        simulate(pairs, THROW, t1=1.5)
+
+
 @motions
 def test_transformations_compose(motion):
     """jit, vmap and grad in any order give the same numbers."""
