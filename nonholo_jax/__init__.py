@@ -1,5 +1,6 @@
 """Rough rigid balls, and other nonholonomic systems, through their collisions: batched, compiled, differentiable."""
 
+from . import _clock as _clock
 from ._air import Air as Air
 from ._ball import Ball as Ball, BallState as BallState
 from ._box import Box as Box, Rectangle as Rectangle

@@ -12,6 +12,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
+from . import _clock
+
 DONE, BAD_INPUT, FAILED = 0, 2, 3
 _UNITS = {"position": "m", "velocity": "m/s", "spin": "rad/s", "gravity": "m/s^2", "point": "m", "center": "m",
           "radius": "m", "half_size": "m", "mass": "kg", "wind": "m/s", "density": "kg/m^3"}  # fmt: skip
@@ -85,7 +87,8 @@ def _run(options: argparse.Namespace, from_start: bool) -> int:
     with _precision(options.float32):
         from .scene_file import SceneError, load_scene
 
-        importing = _seconds_since_start() if from_start else time.perf_counter() - began
+        whole = _clock.CPU_BEFORE + time.perf_counter() - _clock.BEGAN
+        importing = whole if from_start else time.perf_counter() - began
         try:
             file = load_scene(options.scene)
         except SceneError as error:
@@ -128,16 +131,6 @@ def _precision(single: bool) -> Iterator[None]:
         yield
     finally:
         jax.config.update("jax_enable_x64", before)
-
-
-def _seconds_since_start() -> float:
-    """Wall seconds since the process began where the system tells (Linux), else its CPU seconds."""
-    try:
-        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
-        elapsed = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
-    except (OSError, ValueError, IndexError, AttributeError):
-        return time.process_time()
-    return elapsed if elapsed > 0 else time.process_time()  # a container may count from its own start
 
 
 class _CompileClock:

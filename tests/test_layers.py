@@ -10,6 +10,7 @@ import nonholo_jax
 PACKAGE = pathlib.Path(nonholo_jax.__file__).parent
 # From the ground up. `_motion*` and the faces may be several files.
 ORDER = [
+    "_clock",
     "_types",
     "_vector",
     "_shared",
