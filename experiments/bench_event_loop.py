@@ -1,5 +1,7 @@
 """One flat event loop against restarting a solver at every bounce.
 
+"flat" is this library as it is, "untiled" the same with all lanes in one loop instead of tiles of a few.
+
 A ball with drag and Magnus force between a floor and a ceiling, many different throws, 1.5 s, about 4 bounces each,
 float64. Both ways use Tsit5 with the same tolerances; errors of the final position are against a run at 1e-12. The
 times are medians of interleaved runs after compilation, so that a busy machine slows both.
@@ -89,9 +91,9 @@ def restarted(tolerance: float):
     return jax.jit(jax.vmap(run))
 
 
-def flat(tolerance: float):
+def flat(tolerance: float, **how):
     """This library."""
-    motion = Integrated(rtol=tolerance, atol=tolerance)
+    motion = Integrated(rtol=tolerance, atol=tolerance, **how)
 
     def run(state):
         options = {"max_impacts": MAX_BOUNCES, "log_size": 0, "throw": False}
@@ -127,7 +129,11 @@ def main() -> None:
     )
     rows = []
     for tolerance in (1e-6, 1e-8, 1e-10):
-        ways = {"restarted": restarted(tolerance), "flat": flat(tolerance)}
+        ways = {
+            "restarted": restarted(tolerance),
+            "flat": flat(tolerance),
+            "untiled": flat(tolerance, tile=options.throws),
+        }
         first = {name: compiled(way, states) for name, way in ways.items()}
         runs = {name: [] for name in ways}
         for _ in range(options.runs):

@@ -1,5 +1,6 @@
 """Boxes and rectangles: a ball that touches one has its centre on a box with rounded edges and corners."""
 
+from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
@@ -92,7 +93,37 @@ def _rotation_axes(rotation: Any) -> tuple:
     return tuple(tuple(turn[i, j] for i in range(3)) for j in range(3))
 
 
-class Box(AbstractSurface):
+class _AbstractBlock(AbstractSurface):
+    """What a solid box and a thin plate share: half sizes along axes of their own."""
+
+    center: eqx.AbstractVar[Any]
+    half_size: eqx.AbstractVar[Any]
+
+    @abstractmethod
+    def _frame(self) -> tuple[Any, Any, tuple]:
+        """The centre, three half sizes, and the axes in the world frame."""
+
+    def direction(self, x, t):
+        center, half, axes = self._frame()
+        return _box_direction(_in_frame(x, center, axes), half, axes)
+
+    def level(self, x, t, radius):
+        center, half, axes = self._frame()
+        return _box_level(_in_frame(x, center, axes), half, radius)
+
+    def reach(self, x, radius):
+        center, half, axes = self._frame()
+        return maximum(norm(_excess(_in_frame(x, center, axes), half)), radius)
+
+    def bend(self, window, t, radius):
+        center, half, axes = self._frame()
+        return _box_bend(window, axes, center, half, radius)
+
+    def extent(self):
+        return plus(norm(components(self.center)), norm(components(self.half_size)))
+
+
+class Box(_AbstractBlock):
     """A solid box with faces, edges and corners: a table top, a step, a brick.
 
     **Arguments:** `center` in m, shape (3,); `half_size` in m, shape (3,), positive; `law` of contact; `rotation`, a
@@ -120,30 +151,11 @@ class Box(AbstractSurface):
         center, half, axes = self._frame()
         return _box_distance(_in_frame(x, center, axes), half)
 
-    def direction(self, x, t):
-        center, half, axes = self._frame()
-        return _box_direction(_in_frame(x, center, axes), half, axes)
-
-    def level(self, x, t, radius):
-        center, half, axes = self._frame()
-        return _box_level(_in_frame(x, center, axes), half, radius)
-
-    def reach(self, x, radius):
-        center, half, axes = self._frame()
-        return maximum(norm(_excess(_in_frame(x, center, axes), half)), radius)
-
-    def bend(self, window, t, radius):
-        center, half, axes = self._frame()
-        return _box_bend(window, axes, center, half, radius)
-
-    def extent(self):
-        return plus(norm(components(self.center)), norm(components(self.half_size)))
-
     def is_proper(self, radius):
         return [positive("half_size", h) for h in components(self.half_size)]
 
 
-class Rectangle(AbstractSurface):
+class Rectangle(_AbstractBlock):
     """A thin plate with edges; the ball bounces on both of its sides.
 
     **Arguments:** `center` in m, shape (3,); `normal`, shape (3,); `tangent`, shape (3,), the direction of the first
@@ -177,25 +189,6 @@ class Rectangle(AbstractSurface):
     def distance(self, x, t):
         center, half, axes = self._frame()
         return norm(_excess(_in_frame(x, center, axes), half))
-
-    def direction(self, x, t):
-        center, half, axes = self._frame()
-        return _box_direction(_in_frame(x, center, axes), half, axes)
-
-    def level(self, x, t, radius):
-        center, half, axes = self._frame()
-        return _box_level(_in_frame(x, center, axes), half, radius)
-
-    def reach(self, x, radius):
-        center, half, axes = self._frame()
-        return maximum(norm(_excess(_in_frame(x, center, axes), half)), radius)
-
-    def bend(self, window, t, radius):
-        center, half, axes = self._frame()
-        return _box_bend(window, axes, center, half, radius)
-
-    def extent(self):
-        return plus(norm(components(self.center)), norm(components(self.half_size)))
 
     def is_proper(self, radius):
         n, raw = components(self.facing), components(self.tangent)

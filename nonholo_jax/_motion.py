@@ -61,10 +61,21 @@ class AbstractMotion(eqx.Module):
         """Whether the arc is accurate enough, and the control for the next one."""
 
 
+def check_counts(**counts: int) -> None:
+    """Raise `ValueError` for a count that is no whole number of at least 1."""
+    for name, value in counts.items():
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ValueError(f"Argument `{name}` must be a whole number of at least 1, but got {value!r}; try 64.")
+
+
 class Exact(AbstractMotion):
     """Closed-form flight in uniform gravity: parabolas, without an integrator and without a tolerance.
 
-    Refuses (with `ValueError`) a scene with air, and an `Implicit` surface without a bound of its curvature.
+    **Arguments:** `safe_steps`, `tile`: speed only. How often one turn of the event loop may look ahead for a crossing,
+    and how many lanes of a batch share one loop on a CPU.
+
+    Refuses (with `ValueError`) a scene with air, and an `Implicit` surface without a bound of its curvature. Raises
+    `ValueError` for counts below 1.
 
     ```python
     from nonholo_jax import Exact
@@ -75,6 +86,9 @@ class Exact(AbstractMotion):
     safe_steps: int = eqx.field(static=True, default=1)
     tile: int = eqx.field(static=True, default=256)
     is_closed_form: ClassVar[bool] = True
+
+    def __check_init__(self):
+        check_counts(safe_steps=self.safe_steps, tile=self.tile)
 
     def check(self, system):
         if system.uniform_acceleration() is None:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._crossing import Arc
-from ._motion import AbstractMotion, Piece
+from ._motion import AbstractMotion, Piece, check_counts
 from ._shared import shared
 from ._types import Scalar
 from ._vector import frozen, plus, root, times, total
@@ -39,6 +39,8 @@ class Integrated(AbstractMotion):
     - `rtol`, `atol`: relative and absolute tolerance of one step.
     - `dt0`: first step in s, or `None` to have it chosen.
     - `max_steps`: bound on the number of steps, after which the result is `step_limit`.
+    - `safe_steps`, `tile`: speed only. How often one turn of the event loop may look ahead for a crossing, and how many
+        lanes of a batch share one loop on a CPU.
 
     Raises `ValueError` for a solver that is not explicit, or a controller of another class.
 
@@ -76,8 +78,7 @@ class Integrated(AbstractMotion):
             )
         if self._is_constant and self.dt0 is None:
             raise ValueError("Argument `dt0` must be given with constant steps, but got None; try dt0=1e-3.")
-        if self.max_steps < 1:
-            raise ValueError(f"Argument `max_steps` must be at least 1, but got {self.max_steps}; try 4096.")
+        check_counts(max_steps=self.max_steps, safe_steps=self.safe_steps, tile=self.tile)
 
     @property
     def _is_constant(self) -> bool:

@@ -1,5 +1,7 @@
 """Spheres and cylinders, from outside and from inside."""
 
+import functools
+from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
@@ -57,7 +59,51 @@ def _round_bend(window: Window, axes: tuple, origin: Vector3, reach: Number, ins
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-class Sphere(AbstractSurface):
+class _AbstractRound(AbstractSurface):
+    """What a sphere and a cylinder share: a distance from a middle, across two or three axes."""
+
+    radius: eqx.AbstractVar[Number]
+    inside: eqx.AbstractVar[bool]
+
+    @abstractmethod
+    def _frame(self) -> tuple[Vector3, tuple]:
+        """A point in the middle, and the axes across which the surface is round."""
+
+    @property
+    def _sign(self) -> float:
+        return -1.0 if self.inside else 1.0
+
+    def _reach(self, radius):
+        return plus(self.radius, times(self._sign, radius))
+
+    def _across(self, x):
+        middle, axes = self._frame()
+        d = subtract(x, middle)
+        return tuple(dot(axis, d) for axis in axes)
+
+    def distance(self, x, t):
+        return times(self._sign, plus(norm(self._across(x)), times(-1.0, self.radius)))
+
+    def direction(self, x, t):
+        n = scale(self._sign, unit(self._across(x)))
+        _, axes = self._frame()
+        return functools.reduce(add, [scale(c, axis) for c, axis in zip(n, axes, strict=True)])
+
+    def level(self, x, t, radius):
+        return _round_level(self._across(x), self._reach(radius), self.inside)
+
+    def reach(self, x, radius):
+        return self._reach(radius) if self.inside else norm(self._across(x))
+
+    def bend(self, window, t, radius):
+        middle, axes = self._frame()
+        return _round_bend(window, axes, middle, self._reach(radius), self.inside)
+
+    def extent(self):
+        return plus(norm(self._frame()[0]), self.radius)
+
+
+class Sphere(_AbstractRound):
     """A fixed sphere; the ball is outside it, or inside where `inside` is True.
 
     **Arguments:** `center` in m, shape (3,); `radius` > 0 in m (larger than the ball's where `inside`); `law` of
@@ -77,27 +123,8 @@ class Sphere(AbstractSurface):
     def __check_init__(self):
         check(self)
 
-    def _reach(self, radius):
-        return plus(self.radius, times(-1.0 if self.inside else 1.0, radius))
-
-    def distance(self, x, t):
-        outward = plus(norm(subtract(x, components(self.center))), times(-1.0, self.radius))
-        return times(-1.0 if self.inside else 1.0, outward)
-
-    def direction(self, x, t):
-        return scale(-1.0 if self.inside else 1.0, unit(subtract(x, components(self.center))))
-
-    def level(self, x, t, radius):
-        return _round_level(subtract(x, components(self.center)), self._reach(radius), self.inside)
-
-    def reach(self, x, radius):
-        return self._reach(radius) if self.inside else norm(subtract(x, components(self.center)))
-
-    def bend(self, window, t, radius):
-        return _round_bend(window, _AXES, components(self.center), self._reach(radius), self.inside)
-
-    def extent(self):
-        return plus(norm(components(self.center)), self.radius)
+    def _frame(self):
+        return components(self.center), _AXES
 
     def is_proper(self, radius):
         return [positive("radius", self.radius), _fits(self.radius, radius, self.inside)]
@@ -108,7 +135,7 @@ def _fits(radius: Number, ball: Number, inside: bool) -> tuple:
     return (radius > ball, sentence) if inside else (True, sentence)
 
 
-class Cylinder(AbstractSurface):
+class Cylinder(_AbstractRound):
     """An endless circular cylinder; the ball is outside it, or inside where `inside` is True.
 
     **Arguments:** `point` on the axis in m, shape (3,); `axis`, shape (3,), any length but zero; `radius` > 0 in m
@@ -130,35 +157,8 @@ class Cylinder(AbstractSurface):
     def __check_init__(self):
         check(self)
 
-    def _reach(self, radius):
-        return plus(self.radius, times(-1.0 if self.inside else 1.0, radius))
-
-    def _across(self, x):
-        axes = _perpendicular(unit(components(self.axis)))
-        d = subtract(x, components(self.point))
-        return axes, tuple(dot(axis, d) for axis in axes)
-
-    def distance(self, x, t):
-        _, y = self._across(x)
-        return times(-1.0 if self.inside else 1.0, plus(norm(y), times(-1.0, self.radius)))
-
-    def direction(self, x, t):
-        axes, y = self._across(x)
-        n = scale(-1.0 if self.inside else 1.0, unit(y))
-        return add(scale(n[0], axes[0]), scale(n[1], axes[1]))
-
-    def level(self, x, t, radius):
-        return _round_level(self._across(x)[1], self._reach(radius), self.inside)
-
-    def reach(self, x, radius):
-        return self._reach(radius) if self.inside else norm(self._across(x)[1])
-
-    def bend(self, window, t, radius):
-        axes = _perpendicular(unit(components(self.axis)))
-        return _round_bend(window, axes, components(self.point), self._reach(radius), self.inside)
-
-    def extent(self):
-        return plus(norm(components(self.point)), self.radius)
+    def _frame(self):
+        return components(self.point), _perpendicular(unit(components(self.axis)))
 
     def is_proper(self, radius):
         return [

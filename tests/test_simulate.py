@@ -319,6 +319,8 @@ WRONG = {
     "controller": lambda: Integrated(stepsize_controller=diffrax.StepTo(jnp.array([0.0, 1.0]))),
     "dt0": lambda: Integrated(stepsize_controller=diffrax.ConstantStepSize()),
     "max_steps": lambda: Integrated(max_steps=0),
+    "tile": lambda: Exact(tile=0),
+    "safe_steps": lambda: Integrated(safe_steps=0),
     "radius": lambda: Ball(-1.0, 1.0),
     "mass": lambda: Ball(1.0, float("nan")),
     "restitution": lambda: Rough(1.5),
