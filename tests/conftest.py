@@ -11,16 +11,12 @@ with install_import_hook("nonholo_jax", "beartype.beartype"):
     import nonholo_jax  # noqa: F401
 
 
-def pytest_configure(config):
-    """Compiled programs are kept between runs and shared by the workers of xdist."""
-    if hasattr(config, "cache"):  # absent under -p no:cacheprovider
-        jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs():
-    """Each compiled program holds memory maps, of which a process may have 65,530: let go of those of each file."""
+    """Let go of the programs of each file: hundreds of them stay in memory otherwise.
+
+    Nor is JAX's cache on disk used: a worker was seen to crash while JAX 0.10 wrote a program to it. To have it all the
+    same, when tests are run again and again, set JAX_COMPILATION_CACHE_DIR."""
     yield
     jax.clear_caches()
 
