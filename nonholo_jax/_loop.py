@@ -207,7 +207,9 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     broken = ended & ~jnp.isfinite(time + sum(arrived_leaf.sum() for arrived_leaf in jax.tree.leaves(arrived)))
     (broken,) = _shared_flags((broken,))
     result = RESULTS.where(broken, RESULTS.invalid_state, result)
-    exhausted = (c.n_turns + 1 >= motion.max_turns(max_impacts)) & ~(reached | stopped | broken)
+    n_arcs = c.n_arcs + ended.astype(jnp.int32)
+    exhausted = (c.n_turns + 1 >= motion.max_turns(max_impacts)) | (n_arcs >= motion.max_pieces(max_impacts))
+    exhausted = exhausted & ~(reached | stopped | broken)
     result = RESULTS.where(exhausted, RESULTS.step_limit, result)
     new = c._replace(
         time=jnp.where(ended, time, c.time),
@@ -220,7 +222,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
         control=_keep(ended | ~kept, control, c.control),
         since=jnp.where(struck, 0.0, jnp.where(ended, since, c.since)),
         n_impacts=c.n_impacts + struck.astype(jnp.int32),
-        n_arcs=c.n_arcs + ended.astype(jnp.int32),
+        n_arcs=n_arcs,
         n_turns=c.n_turns + 1,
         n_at_once=jnp.where(struck, n_at_once, c.n_at_once),
         done=reached | stopped | exhausted | broken,

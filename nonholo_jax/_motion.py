@@ -36,11 +36,11 @@ class AbstractMotion(eqx.Module):
 
     @abstractmethod
     def max_pieces(self, max_impacts: int) -> int:
-        """The largest number of arcs."""
+        """The largest number of arcs. A motion that would need more ends as `step_limit`."""
 
     @abstractmethod
     def max_turns(self, max_impacts: int) -> int:
-        """The largest number of turns of the loop."""
+        """The largest number of turns of the loop: never the first bound to be met, unless a search stands still."""
 
     @abstractmethod
     def begin(self, system: AbstractSystem, time: Scalar, state: Any, t1: Scalar) -> tuple[Any, Any]:

@@ -38,7 +38,8 @@ class Integrated(AbstractMotion):
         `diffrax.ConstantStepSize()` with `dt0`.
     - `rtol`, `atol`: relative and absolute tolerance of one step.
     - `dt0`: first step in s, or `None` to have it chosen.
-    - `max_steps`: bound on the number of steps, after which the result is `step_limit`.
+    - `max_steps`: bound on the number of accepted steps (arcs, each cut short by an impact included), after which the
+        result is `step_limit`.
     - `safe_steps`, `tile`: speed only. How often one turn of the event loop may look ahead for a crossing, and how many
         lanes of a batch share one loop on a CPU.
 
@@ -99,7 +100,8 @@ class Integrated(AbstractMotion):
         return self.max_steps
 
     def max_turns(self, max_impacts):
-        return self.max_steps
+        # Generous, for `max_steps` counts arcs: rejected steps, and further search along an arc, take turns but no arc.
+        return 16 * (self.max_steps + 16)
 
     def begin(self, system, time, state, t1):
         term, z = _term(system, state), system.evolving(state)

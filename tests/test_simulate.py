@@ -143,6 +143,28 @@ def test_a_wedge_is_a_corner_or_resolves():
     assert int(out.n_impacts) == 2 and np.all(np.asarray(out.impacts.time[:2]) == 1.0)
 
 
+def test_max_steps_counts_arcs_whatever_the_search_and_rejected_steps_take():
+    """A bowl with air takes many looks for a crossing, and the first step is far too large: turns without an arc."""
+    bowl = Scene(Ball(R, 0.02), {"bowl": Sphere((0.0, 0.0, 1.0), 1.0, Rough(0.9), inside=True)}, air=Air())
+    throw = BallState([0.3, 0.0, 1.0], [1.0, 2.0, 0.0], [0.0, 40.0, 0.0])
+
+    def run(throw, max_steps, safe_steps):
+        motion = Integrated(diffrax.Heun(), rtol=1e-3, atol=1e-3, dt0=1.0, max_steps=max_steps, safe_steps=safe_steps)
+        return simulate(bowl, throw, t1=1.0, max_impacts=8, log_size=0, motion=motion, throw=False)
+
+    whole = run(throw, 256, 3)
+    n = int(whole.n_arcs)
+    assert result_of(whole) == "reached_t1" and int(whole.n_impacts) >= 2
+    for safe_steps in (1, 8):
+        tight, short = run(throw, n, safe_steps), run(throw, n - 1, safe_steps)
+        assert result_of(tight) == "reached_t1" and int(tight.n_arcs) == n
+        np.testing.assert_allclose(stacked(tight.final), stacked(whole.final), rtol=0, atol=1e-12)
+        assert result_of(short) == "step_limit" and int(short.n_arcs) == n - 1
+    # Derivatives repeat the path from a record with `max_steps` rows: all of them are used, and enough.
+    slopes = [jax.jvp(lambda x, m=m: stacked(run(x, m, 1).final), (throw,), (throw,))[1] for m in (n, 256)]
+    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-10, atol=1e-10)
+
+
 # Logs
 
 
