@@ -62,7 +62,7 @@ class Scene(AbstractSystem):
 
     ball: Ball
     surfaces: tuple[AbstractSurface, ...]
-    gravity: Any
+    gravity: Any = eqx.field(converter=as_vector)
     air: Air | None
     names: tuple[str, ...] = eqx.field(static=True)
 

@@ -15,8 +15,9 @@ from ._motion_integrated import Integrated
 from ._system import AbstractSystem
 from ._trajectory import Trajectory, packaged
 from ._types import is_failure, result_message, result_name
+from ._vector import as_number, as_pair, as_quaternion, as_vector
 
-_VECTORS = ("point", "facing", "tangent", "center", "half_size", "rotation", "axis", "gravity", "wind")
+_NDIM = {as_number: 0, as_vector: 1, as_pair: 1, as_quaternion: 1}
 
 
 class SimulationError(RuntimeError):
@@ -119,17 +120,34 @@ def _check_scene(scene: Any, axes: list) -> None:
     """Every number of a scene is one number, and every vector one vector, but for the axis that is mapped."""
     leaves = jax.tree_util.tree_flatten_with_path(scene)[0]
     for (path, leaf), axis in zip(leaves, axes, strict=True):
-        fields = [key.name for key in path if isinstance(key, jax.tree_util.GetAttrKey)]
-        if not eqx.is_array(leaf) or "function" in fields:  # the numbers of a gap function are its own affair
+        wanted = _ndim(scene, path)
+        if not eqx.is_array(leaf) or wanted is None:
             continue
-        own = leaf.shape if axis is None else leaf.shape[:axis] + leaf.shape[axis:][1:]
-        whole = isinstance(path[-1], jax.tree_util.GetAttrKey) and fields[-1] in _VECTORS  # else one of its components
-        if len(own) != whole:
+        if leaf.ndim - (axis is not None) != wanted:
             what = jax.tree_util.keystr(path, simple=True, separator=".")
             raise ValueError(
                 f"Argument `scene` must hold one value per motion in `{what}`, but got an array of shape {leaf.shape}; "
                 "try simulate_batch(..., scene_axes=0), or vmap, for many scenes."
             )
+
+
+def _ndim(owner: Any, path: tuple) -> int | None:
+    """How many axes a leaf has by the converter of its field: 0 for a number or one component of a vector, 1 for a
+    vector, `None` where no converter says (arrays of one's own surfaces, laws and gaps may have any shape)."""
+    wanted = None
+    for key in path:
+        if isinstance(key, jax.tree_util.GetAttrKey):  # of a module; of a NamedTuple, too, which has no converters
+            field = getattr(type(owner), "__dataclass_fields__", {}).get(key.name)
+            wanted = None if field is None else _NDIM.get(field.metadata.get("converter"))
+            owner = getattr(owner, key.name, None)
+        elif isinstance(key, jax.tree_util.SequenceKey):
+            wanted = None if wanted is None else wanted - 1
+            owner = owner[key.idx]
+        elif isinstance(key, jax.tree_util.DictKey):
+            wanted, owner = None, owner[key.key]
+        else:  # a container of somebody's own
+            return None
+    return wanted
 
 
 @eqx.filter_jit
