@@ -262,6 +262,7 @@ def _design(file: Any) -> _Answer:
     import jax
 
     from ._design import design
+    from ._goal import ReturnTo
     from ._types import result_name
 
     answer = design(file.scene, file.throw, **file.design.arguments, **file.simulate.arguments)
@@ -295,7 +296,7 @@ def _design(file: Any) -> _Answer:
             f"{answer.miss:.3g} m; widen `design.bounds`, free more, raise `n_starts`, or change the itinerary"
         )
     goal = file.design.goal
-    drawing = {"hand" if type(goal).__name__ == "ReturnTo" else "target": goal.point}
+    drawing = {"hand" if isinstance(goal, ReturnTo) else "target": goal.point}
     return _Answer(report, text, answer.trajectory, drawing, failure)
 
 

@@ -33,10 +33,10 @@ FALL = (np.sqrt(2.0**2 + 2 * G * (1 - R)) - 2.0) / G  # of a throw downwards wit
 THROW = BallState(START, [1.0, 0.0, -2.0], [0.0, 0.0, 0.0])
 
 
-def room(law=None, *, ball=None):
+def room(law=None):
     floor = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Rough() if law is None else law)
     ceiling = Plane((0.0, 0.0, 3.0), (0.0, 0.0, -1.0), Rough())
-    return Scene(Ball(R, 0.046) if ball is None else ball, {"floor": floor, "ceiling": ceiling})
+    return Scene(Ball(R, 0.046), {"floor": floor, "ceiling": ceiling})
 
 
 # Closed forms
@@ -82,7 +82,7 @@ def test_numbers_of_the_scene_may_be_free(name):
     wanted = {"surfaces.floor.law.restitution": (0.83, R), "ball.radius": (1.0, 0.04)}[name]
     target = height(*wanted)
     dropped = BallState(START, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-    scene = room(Smooth(1.0), ball=Ball(R, 0.046))
+    scene = room(Smooth(1.0))
     bounds = {"surfaces.floor.law.restitution": [0.5, 1.0], "ball.radius": [0.01, 0.2]}[name]
     answer = design(
         scene, dropped, free=[name], goal=lambda trajectory: trajectory.final.position[2:] - target, t1=0.6,
