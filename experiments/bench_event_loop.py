@@ -3,7 +3,7 @@
 "flat" is this library as it is, "untiled" the same with all lanes in one loop instead of tiles of a few.
 
 A ball with drag and Magnus force between a floor and a ceiling, many different throws, 1.5 s, about 4 bounces each,
-float64. Both ways use Tsit5 with the same tolerances; errors of the final position are against a run at 1e-12. The
+float64. All ways use Tsit5 with the same tolerances; errors of the final position are against a run at 1e-12. The
 times are medians of interleaved runs after compilation, so that a busy machine slows both.
 
     python experiments/bench_event_loop.py [--throws 4096] [--runs 5] [--json FILE]
