@@ -236,6 +236,29 @@ def test_adaptive_steps_agree_with_differences(getkey):
     check_differences(forward, differences(function, flat, index, 1e-3), 1e-6)
 
 
+def test_impact_in_a_last_step_that_t1_cuts():
+    """The size of that step depends on t1, and after another impact on everything: it may not count as given. Air
+    makes it matter: the path within a step does not depend on the step's size on a parabola, nor does Heun's at all."""
+    numbers = all_numbers(PLANE, states([0.0, 0.0, 0.6], [2.0, 1.0, -1.2], [30.0, -40.0, 50.0]))
+    numbers["ball"]["mass"] = jnp.asarray(0.1)
+    flat, unravel = ravel_pytree(numbers)
+    # t1 = 0.35 cuts the first step of 1 s, where the ball hits at about 0.2 s, and the second of 0.18 s.
+    sizes = jnp.asarray([1.0, 0.18])
+
+    def function(x, size):
+        constant = diffrax.ConstantStepSize()
+        motion = Integrated(diffrax.Midpoint(), stepsize_controller=constant, dt0=size, max_steps=8)
+        return move(PLANE, motion, unravel(x), Rough(0.9), with_air=True)
+
+    flat = jnp.stack([flat, flat])
+    forward, reverse, (n_impacts, _, time) = both_modes(function, flat, sizes)
+    assert np.all(np.asarray(n_impacts) >= 1) and np.all((np.asarray(time) > 0.18) & (np.asarray(time) < 0.3))
+    assert relative(forward, reverse) < 1e-12
+    check_differences(forward, differences(function, flat, sizes, 1e-4), 1e-9)
+    at_t1 = int(unravel(jnp.arange(flat.shape[1], dtype=float))["t1"])
+    assert np.all(np.abs(forward[:, 9, at_t1]) > 1e-3)  # even the time of the impact depends on t1, by such a step
+
+
 def test_each_law_alone_agrees_with_the_choice_of_laws(getkey):
     """One program per law, with what it knows at trace time, against the program that chooses lane by lane."""
     function, unravel = one_motion(PLANE, Exact())
