@@ -218,6 +218,25 @@ def test_order_of_convergence_through_an_impact(name, reference):
     assert abs(slope - order) < 0.2, (slope, np.exp(errors))
 
 
+@pytest.mark.parametrize("name", ["heun", "midpoint", "ralston"])
+def test_large_steps_of_second_order_are_exact_on_parabolas(name, getkey):
+    """Their end points are, and so must be the paths between: an impact cuts a step anywhere, and the next begins
+    with the velocity that the path has there."""
+    scene = Scene(Ball(R, 0.7), room(Rough(0.95, 0.3)), GRAVITY)
+    throw = random_states(generator(getkey()), 64, -0.85, 0.85, 3.0)
+    constant = diffrax.ConstantStepSize()
+    motion = Integrated(SOLVERS[name][0], stepsize_controller=constant, dt0=0.27, max_steps=64)
+    options = {"t1": 1.0, "max_impacts": 24}
+    found, exact = (simulate_batch(scene, throw, **options, motion=each) for each in (motion, Exact()))
+    counts = np.asarray(exact.n_impacts)
+    assert np.array_equal(found.n_impacts, counts) and counts.mean() > 3
+    assert np.array_equal(found.impacts.surface, exact.impacts.surface)
+    np.testing.assert_allclose(found.impacts.time, exact.impacts.time, rtol=0, atol=1e-12)
+    scale = np.array([1.0] * 6 + [1 / R] * 3)  # r omega is a velocity
+    difference = np.abs(np.asarray(stacked(found.final)) - np.asarray(stacked(exact.final))) / scale
+    assert difference.max() < 1e-12
+
+
 # What every motion keeps
 
 
