@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from nonholo_jax import Air, Ball, BallState, Integrated, Plane, Rough, Scene, simulate
+from nonholo_jax import KINDS, Air, Ball, BallState, Integrated, Plane, Rough, Scene, simulate
 
 jax.config.update("jax_enable_x64", True)
 
@@ -49,7 +49,7 @@ def restarted(tolerance: float):
 
     def field(t, y, spin):
         v = y[3:]
-        a = SCENE.acceleration(t, SCENE.unpacked(BallState(y[:3], v, spin)), tuple(y[:3]), tuple(v))
+        _, a = SCENE.derivative(t, SCENE.unpacked(BallState(y[:3], v, spin)), tuple(y[:3]), tuple(v))
         return jnp.concatenate([v, jnp.stack([jnp.asarray(c, dtype=y.dtype) for c in a])])
 
     floor = lambda t, y, args, **_: y[2] - BALL.radius  # noqa: E731
@@ -76,7 +76,7 @@ def restarted(tolerance: float):
         end, y = solution.ts[0], solution.ys[0]
         state = SCENE.unpacked(BallState(y[:3], y[3:], spin))
         hit = jnp.where(y[2] < 0.5 * CEILING, 0, 1)
-        after = SCENE.packed(SCENE.impact(hit, end, state))
+        after = SCENE.packed(SCENE.impact(hit, end, state, KINDS.bounce)[0])
         going = end < T1
         velocity = jnp.where(going, after.velocity, y[3:])
         spin = jnp.where(going, after.spin, spin)

@@ -82,3 +82,24 @@ class BallState(eqx.Module):
     velocity: Float[Array, "*batch 3"] = eqx.field(converter=_as_array)
     spin: Float[Array, "*batch 3"] = eqx.field(converter=_as_array)
     orientation: Float[Array, "*batch 4"] | None = eqx.field(converter=_as_array, default=None)
+
+
+def check_ball_state(state: Any, batch: bool) -> None:
+    """Raise `ValueError` for shapes that are not those of one state, or of one batch of states."""
+    if not isinstance(state, BallState):
+        raise ValueError(f"Argument `state` must be a BallState, but got {type(state).__name__}; try BallState(...).")
+    names = [("position", 3), ("velocity", 3), ("spin", 3), ("orientation", 4)]
+    sizes = set()
+    for name, n in names:
+        x = getattr(state, name, None)
+        if x is None:
+            continue
+        want = f"(N, {n})" if batch else f"({n},)"
+        if x.ndim != (2 if batch else 1) or x.shape[-1] != n:
+            other = "simulate() for one state" if batch else "simulate_batch() or vmap for a batch"
+            raise ValueError(f"Argument `state.{name}` must have shape {want}, but got {x.shape}; try {other}.")
+        sizes.add(x.shape[0] if batch else 1)
+    if len(sizes) > 1:
+        raise ValueError(
+            f"Argument `states` must have one batch size, but got {sorted(sizes)}; try jnp.broadcast_to on the shorter."
+        )

@@ -23,9 +23,10 @@ from ._vector import frozen, norm, select, slope, times
 
 class Arc(eqx.Module):
     """Smooth motion from `time` on: polynomials of the configuration and of its rate (per second) in local time,
-    which runs from 0 to `length` in units of `unit` seconds."""
+    which runs from 0 to `length` in units of `unit` seconds. It began at the state `start`."""
 
     time: Scalar
+    start: Any
     configuration: tuple[Polynomial, ...]
     rate: tuple[Polynomial, ...]
     length: Number
@@ -81,7 +82,7 @@ def _here(arc: Arc, s: Any) -> _Here:
 def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, window: Any, touching: Any) -> _Step:
     s, coefficients, size = here
     left = arc.length - s
-    value, rate = slope(lambda x: system.level(contact, arc.time, x), here.position, here.tangent)
+    value, rate = slope(lambda x: system.level(contact, arc.time, x, arc.start), here.position, here.tangent)
     tolerance = rounding(system, contact, size)
     reach = system.reach(contact, here.position)
     exact = reach is None and all(len(p) <= 3 for p in coefficients)
@@ -92,7 +93,7 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, wind
         width = jnp.where(speed * left > 2.0 * reach, 2.0 * reach / jnp.where(speed > 0, speed, 1.0), left)
     if not exact:  # the reach is a first guess; from then on the window knows better
         width = jnp.where(jnp.isinf(window), width, jnp.minimum(left, window))
-    bend = system.bend(contact, arc.time, Window(coefficients, width))
+    bend = system.bend(contact, arc.time, Window(coefficients, width), arc.start)
     m, most = (jnp.asarray(x, dtype=arc.time.dtype) for x in bend)
     value, rate, m, most, width = shared([value, rate, m, most, width])
 
@@ -164,8 +165,8 @@ def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meet
     here = _here(arc, s)
     columns = []
     for i in range(system.n_contacts):
-        value, rate = slope(lambda x, i=i: system.level(i, arc.time, x), here.position, here.tangent)
-        bend = system.bend(i, arc.time, Window(here.coefficients, 0.0))
+        value, rate = slope(lambda x, i=i: system.level(i, arc.time, x, arc.start), here.position, here.tangent)
+        bend = system.bend(i, arc.time, Window(here.coefficients, 0.0), arc.start)
         columns.append((value, rate, bend.low, rounding(system, i, here.size)))
     value, rate, bend, tolerance = shared([select(contact, column) for column in zip(*columns, strict=True)])
     return Meeting(value, rate, (bend < 0) & (rate * rate <= -2.0 * bend * tolerance))  # pyright: ignore
@@ -184,6 +185,8 @@ def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Sc
     s = frozen(s)
     for _ in range(2):
         q, tangent = arc.position(s), arc.tangent(s)
-        pairs = [slope(lambda x, i=i: system.level(i, arc.time, x), q, tangent) for i in range(system.n_contacts)]
+        pairs = [
+            slope(lambda x, i=i: system.level(i, arc.time, x, arc.start), q, tangent) for i in range(system.n_contacts)
+        ]
         (s,) = shared([newton(arc, s, *(select(contact, column) for column in zip(*pairs, strict=True)))])
     return s

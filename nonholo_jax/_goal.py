@@ -118,7 +118,7 @@ def _closest_approach(trajectory: Trajectory, point: Any, first: int, everywhere
         low, high, t = _bracket(frozen(trajectory), point, frozen(begin), everywhere)
         state, low, high = trajectory.at(t), low - t, high - t
     inner = trajectory.system.unpacked(state)
-    pull = trajectory.system.acceleration(t, inner, *trajectory.system.evolving(inner))
+    _, pull = trajectory.system.derivative(t, inner, *trajectory.system.evolving(inner))
     offset, velocity = state.position - point, state.velocity
     bend = jnp.stack([jnp.asarray(a, dtype=t.dtype) for a in pull])
     s = low + (high - low) * _samples(_ON_ONE_ARC, t.dtype)[:, None]

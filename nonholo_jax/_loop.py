@@ -20,7 +20,7 @@ from ._motion import AbstractMotion
 from ._shared import shared
 from ._system import AbstractSystem
 from ._tiles import in_tiles
-from ._types import RESULTS
+from ._types import KINDS, RESULTS
 from ._vector import frozen, norm
 
 _CHUNK = 16
@@ -31,6 +31,7 @@ class Row(NamedTuple):
     """One impact, as the log keeps it."""
 
     time: Any
+    until: Any  # when `after` holds: later than `time` if a train is summed
     duration: Any
     before: Any
     after: Any
@@ -40,15 +41,15 @@ class Log(NamedTuple):
     """Impacts in the order in which they happen: floats packed into one buffer, one write an impact."""
 
     values: Any
-    contact: Any
+    labels: Any  # contact, kind, and the phase that follows, or -1
 
 
 class Path(NamedTuple):
     """What `replay` needs of every arc: its size in seconds (infinite for one that reaches as far as t1, whose size
-    has derivatives), where it was cut in local time, and by which contact."""
+    has derivatives), where it was cut in local time, by which contact, and what kind of impact that was."""
 
     sizes: Any
-    contact: Any
+    labels: Any
 
 
 class Outcome(NamedTuple):
@@ -92,7 +93,7 @@ def pack_row(row: Row) -> Any:
 
 def unpack_row(values: Any, like: Any) -> Row:
     """The rows of a log, leading axes kept; `like` is a state of the right structure."""
-    leaves, treedef = jax.tree.flatten(Row(jnp.zeros(()), jnp.zeros(()), like, like))
+    leaves, treedef = jax.tree.flatten(Row(jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), like, like))
     rows, start = [], 0
     for leaf in leaves:
         stop = start + jnp.size(leaf)
@@ -107,8 +108,8 @@ def _arrays(state: Any, dtype: Any) -> Any:
 
 
 def _empty_log(state: Any, like: Any, rows: int) -> Log:
-    width = pack_row(Row(like, like, state, state)).size
-    return Log(jnp.full((rows, width), jnp.nan, like.dtype), jnp.full((rows,), -1, jnp.int32))
+    width = pack_row(Row(like, like, like, state, state)).size
+    return Log(jnp.full((rows, width), jnp.nan, like.dtype), jnp.full((rows, 3), -1, jnp.int32))
 
 
 def _write(buffer: Any, index: Any, wanted: Any, value: Any) -> Any:
@@ -151,7 +152,7 @@ def _start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> _Car
         n_turns=zero,
         n_at_once=zero,
         log=_empty_log(state, t0, log_rows),
-        path=Path(jnp.zeros((path_rows, 2), t0.dtype), jnp.full((path_rows,), -1, jnp.int32)),
+        path=Path(jnp.zeros((path_rows, 2), t0.dtype), jnp.full((path_rows, 2), -1, jnp.int32)),
         done=~admissible,
         result=RESULTS.where(admissible, RESULTS.reached_t1, RESULTS.invalid_state),
     )
@@ -179,31 +180,37 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     elapsed = s * arc.unit
     reached = through & last
     time = jnp.where(reached, t1, c.time + elapsed)
-    arrived = _arrays(system.advanced(c.state, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
+    arrived = _arrays(system.advanced(time, c.state, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
     arrived = _shared(arrived)
 
     since = c.since + elapsed
-    at_once = since * norm(frozen(arc.velocity(s))) <= _tiny(system, arc, s)
+    at_once = since * norm(frozen(arc.tangent(s))) <= _tiny(arc, s) * arc.unit
     n_at_once = jnp.where(at_once & (c.n_impacts > 0), c.n_at_once + 1, 0)
     full = c.n_impacts >= max_impacts
     stuck = n_at_once > _MOST_IMPACTS_AT_ONCE
-    stopped = crossed & (resting | full | stuck)
+    kind, fault, after, pause = KINDS.unused, RESULTS.reached_t1, arrived, 0.0
+    if system.n_contacts > 0:
+        kind, fault = system.follows(found.contact, time, arrived, t1 - time, resting)
+        after, pause = system.impact(found.contact, time, arrived, kind)
+        after = _arrays(after, t1.dtype)
+    failed = fault != RESULTS.reached_t1
+    stopped = crossed & (failed | full | stuck)
     stopped, crossed = _shared_flags((stopped, crossed))
     struck = crossed & ~stopped
-    after = _arrays(system.impact(found.contact, time, arrived), t1.dtype) if system.n_contacts > 0 else arrived
-    row = pack_row(Row(time, since, arrived, after))
+    until = time + pause
+    labels = jnp.stack([found.contact, _code(kind), system.phase(after)])
     log = Log(
-        _write(c.log.values, c.n_impacts, struck & ~c.done, row),
-        _write(c.log.contact, c.n_impacts, struck & ~c.done, found.contact),
+        _write(c.log.values, c.n_impacts, struck & ~c.done, pack_row(Row(time, until, since, arrived, after))),
+        _write(c.log.labels, c.n_impacts, struck & ~c.done, labels),
     )
     path = Path(
         _write(c.path.sizes, c.n_arcs, ended & ~c.done, frozen(jnp.stack([jnp.where(last, jnp.inf, length), s]))),
-        _write(c.path.contact, c.n_arcs, ended & ~c.done, found.contact),
+        _write(c.path.labels, c.n_arcs, ended & ~c.done, labels[:2]),
     )
 
     result = RESULTS.where(crossed & full, RESULTS.max_impacts, c.result)
     result = RESULTS.where(crossed & stuck, RESULTS.corner, result)
-    result = RESULTS.where(crossed & resting, RESULTS.sustained_contact, result)
+    result = RESULTS.where(crossed & failed, fault, result)
     broken = ended & ~jnp.isfinite(time + sum(arrived_leaf.sum() for arrived_leaf in jax.tree.leaves(arrived)))
     (broken,) = _shared_flags((broken,))
     result = RESULTS.where(broken, RESULTS.invalid_state, result)
@@ -212,7 +219,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     exhausted = exhausted & ~(reached | stopped | broken)
     result = RESULTS.where(exhausted, RESULTS.step_limit, result)
     new = c._replace(
-        time=jnp.where(ended, time, c.time),
+        time=jnp.where(struck, until, jnp.where(ended, time, c.time)),
         state=_keep(ended, _keep(struck, after, arrived), c.state),
         memory=_keep(ended, piece.memory, c.memory),
         s=jnp.where(kept & ~ended, frozen(found.s), 0.0),
@@ -239,7 +246,16 @@ def _keep_small(condition: Any, a: _Carry, b: _Carry) -> _Carry:
     return _Carry(log=a.log, path=a.path, **fields)
 
 
-def _tiny(system: AbstractSystem, arc: Any, s: Any) -> Any:
+def _code(kind: Any) -> Any:
+    return jnp.asarray(kind._value, dtype=jnp.int32)
+
+
+def kind_of(code: Any) -> KINDS:
+    """The kind of that code."""
+    return eqx.tree_at(lambda kind: kind._value, KINDS.bounce, code)
+
+
+def _tiny(arc: Any, s: Any) -> Any:
     """A length below which two impacts count as one instant."""
     eps = float(jnp.finfo(s.dtype).eps)
     return 64.0 * eps * frozen(norm(arc.position(s)))
@@ -263,12 +279,12 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
     state = jax.tree.map(lambda x: jnp.where(moves, x, 0.0), _arrays(state, t0.dtype))
     t0, t1 = (jnp.where(moves, t, 0.0) for t in (t0, t1))
     _, memory = motion.begin(system, t0, state, t1)
-    log_rows = known.log.contact.shape[0]
+    log_rows = known.log.labels.shape[0]
     reached = known.result == RESULTS.reached_t1
 
     def one(carry, step):
         time, state, memory, jumped, since, n_impacts = carry
-        index, (size, s), contact = step
+        index, (size, s), (contact, code) = step
         used = index < known.n_arcs
         last = reached & (index == known.n_arcs - 1)
         left = t1 - time
@@ -281,15 +297,18 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         s = jnp.where(last, arc.length, s)
         s = jnp.where(used, s, 0.0)
         elapsed = s * arc.unit
-        arrived = _shared(_arrays(system.advanced(state, arc.position(s), arc.velocity(s), elapsed), t1.dtype))
         moved = jnp.where(last, t1, time + elapsed)
+        arrived = _arrays(system.advanced(moved, state, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
+        arrived = _shared(arrived)
         struck = crossed & (n_impacts < known.n_impacts)
-        after = arrived
+        after, until = arrived, moved
         if system.n_contacts > 0:
-            after = _keep(struck, _arrays(system.impact(contact, moved, arrived), t1.dtype), arrived)
-        row = pack_row(Row(moved, since + elapsed, arrived, after)) if log_rows else jnp.zeros((0,), t1.dtype)
+            other, pause = system.impact(contact, moved, arrived, kind_of(code))
+            after = _keep(struck, _arrays(other, t1.dtype), arrived)
+            until = jnp.where(struck, moved + pause, moved)
+        row = pack_row(Row(moved, until, since + elapsed, arrived, after)) if log_rows else jnp.zeros((0,), t1.dtype)
         carry = (
-            jnp.where(used, moved, time),
+            jnp.where(used, until, time),
             _keep(used, after, state),
             _keep(used, piece.memory, memory),
             jnp.where(used, struck, jumped),
@@ -308,21 +327,21 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         return lax.cond(needed, run, lambda carry: carry, carry), None
 
     values = jnp.where(jnp.isnan(known.log.values), known.log.values, 0.0)  # rows that are not used stay NaN
-    rows = path.contact.shape[0]
+    rows = path.labels.shape[0]
     size = min(_CHUNK, rows)
     padding = -rows % size
     steps = (
         jnp.arange(rows + padding, dtype=jnp.int32),
         jnp.pad(path.sizes, ((0, padding), (0, 0))),
-        jnp.pad(path.contact, (0, padding)),
+        jnp.pad(path.labels, ((0, padding), (0, 0))),
     )
     steps = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), steps)
-    steps = (steps[0], (steps[1][..., 0], steps[1][..., 1]), steps[2])
+    steps = (steps[0], *[(pair[..., 0], pair[..., 1]) for pair in steps[1:]])
     zero = jnp.asarray(0, dtype=jnp.int32)
     first = (t0, state, memory, jnp.asarray(True), jnp.zeros_like(t0), zero)
     ((time, state, *_), values), _ = lax.scan(chunk, (first, values), steps)
     time, state = _keep(moves, (time, state), (known.time, known.state))
-    return known._replace(time=time, state=state, log=Log(values, known.log.contact))
+    return known._replace(time=time, state=state, log=Log(values, known.log.labels))
 
 
 def _find(system, motion, state, t0, t1, **options):

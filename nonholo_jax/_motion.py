@@ -91,10 +91,10 @@ class Exact(AbstractMotion):
         check_counts(safe_steps=self.safe_steps, tile=self.tile)
 
     def check(self, system):
-        if system.uniform_acceleration() is None:
+        if not system.is_uniform():
             raise ValueError(
-                "Argument `motion` must be Integrated() where the acceleration is not uniform (air), but got Exact(); "
-                "try motion=None."
+                "Argument `motion` must be Integrated() where the acceleration is not uniform (air, or a system other "
+                "than a ball), but got Exact(); try motion=None."
             )
         for i in range(system.n_contacts):
             if not system.is_bounded(i):
@@ -117,11 +117,10 @@ class Exact(AbstractMotion):
 
     def piece(self, system, time, state, memory, jumped, size):
         q, v = system.evolving(state)
-        a = system.uniform_acceleration()
-        assert a is not None
+        _, a = system.derivative(time, state, q, v)
         configuration = tuple((x, u, times(0.5, w)) for x, u, w in zip(q, v, a, strict=True))
         rate = tuple((u, w) for u, w in zip(v, a, strict=True))
-        return Piece(Arc(time, configuration, rate, size, 1.0), None, None)
+        return Piece(Arc(time, state, configuration, rate, size, 1.0), None, None)
 
     def judge(self, control, size, trial):
         return jnp.asarray(True), None

@@ -127,7 +127,8 @@ class Integrated(AbstractMotion):
             return _unrolled_step(self.solver, system, time, state, size)
         z0 = _arrays(system.evolving(state), time)
         z1, error, info, memory, _ = self.solver.step(_term(system, state), time, time + size, z0, None, memory, jumped)
-        arc = _fitted_arc(self.solver.interpolation_cls(t0=time, t1=time + size, **info), z0, time, size)
+        path = self.solver.interpolation_cls(t0=time, t1=time + size, **info)
+        arc = _fitted_arc(path, z0, time, state, size)
         return Piece(arc, memory, (z0, z1, error))
 
     def judge(self, control, size, trial):
@@ -154,7 +155,7 @@ def _arrays(z: Any, like: Any) -> Any:
 def _term(system: Any, state: Any) -> diffrax.ODETerm:
     def field(t, z, args):
         q, v = z
-        return _arrays((v, system.acceleration(t, state, q, v)), t)
+        return _arrays(system.derivative(t, state, q, v), t)
 
     return diffrax.ODETerm(field)
 
@@ -167,43 +168,49 @@ def _unrolled_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -> P
     """One step of an explicit Runge-Kutta method, stage by stage over scalars, and its interpolant."""
     tableau, (q, v) = solver.tableau, system.evolving(state)
     n = len(q)
-    stages, rates = [], []  # h times the derivative of (q, v), flat; dq/dt itself
+    stages, rates = [], []  # h times the derivative of (q, v), flat; the part of q itself
     for i in range(tableau.num_stages):
         row = tableau.a_lower[i - 1] if i > 0 else ()
         z = [plus(x, _combination(row, [k[j] for k in stages])) for j, x in enumerate((*q, *v))]
         c = 0.0 if i == 0 else float(tableau.c[i - 1])
-        a = system.acceleration(time + c * h, state, tuple(z[:n]), tuple(z[n:]))
-        stages.append(shared([h * x for x in (*z[n:], *a)]))
-        rates.append(z[n:])
+        dq, dv = system.derivative(time + c * h, state, tuple(z[:n]), tuple(z[n:]))
+        stages.append(shared([h * x for x in (*dq, *dv)]))
+        rates.append(dq)
     z0 = (*q, *v)
-    columns = [[k[j] for k in stages] for j in range(2 * n)]
+    columns = [[k[j] for k in stages] for j in range(len(z0))]
     steps = shared([_combination(tableau.b_sol, column) for column in columns])
     z1 = tuple(plus(x, step) for x, step in zip(z0, steps, strict=True))
     error = tuple(_combination(tableau.b_error, column) for column in columns)
     weights = interpolation_weights(solver)
     if len(weights) == 2 and not tableau.fsal:
         means = [_combination(tableau.b_sol, column) for column in zip(*rates, strict=True)]
-        path = [_hermite(*ends, h) for ends in zip(q, v, z1[n:], means, strict=True)]
-        arc = Arc(time, tuple(p for p, _ in path), tuple(r for _, r in path), jnp.ones_like(h), h)
-        return Piece(arc, None, (z0, z1, error))
+        ends, _ = system.derivative(time + h, state, z1[:n], z1[n:])
+        path = tuple(_cubic(*each, h) for each in zip(q, rates[0], ends, means, strict=True))
+        rate = tuple(_quadratic(*each) for each in zip(v, stages[0][n:], z1[n:], strict=True))
+        return Piece(Arc(time, state, path, rate, jnp.ones_like(h), h), None, (z0, z1, error))
     polynomials = []
     for x, step, column in zip(z0, steps, columns, strict=True):
         inner = shared([_combination(row, column) for row in weights])
         # The last coefficient makes the polynomial end where the step ends, to rounding.
         polynomials.append((x, *inner, plus(step, times(-1.0, total(inner)))))
     one = jnp.ones_like(h)
-    arc = Arc(time, tuple(polynomials[:n]), tuple(polynomials[n:]), one, h)
+    arc = Arc(time, state, tuple(polynomials[:n]), tuple(polynomials[n:]), one, h)
     return Piece(arc, None, (z0, z1, error))
 
 
-def _hermite(q0: Any, v0: Any, v1: Any, mean: Any, h: Any) -> tuple[tuple, tuple]:
-    """The cubic with the velocities v0 and v1 at its ends and `mean` between them, and its rate. Diffrax's own cubic
-    takes the last stage for the slope at the end, which it is not where the first stage is not the last of the step
-    before: a ball would leave the floor with another velocity than it has there."""
-    second = plus(times(3.0, mean), times(-1.0, plus(times(2.0, v0), v1)))
-    third = plus(plus(v0, v1), times(-2.0, mean))
+def _cubic(q0: Any, rate0: Any, rate1: Any, mean: Any, h: Any) -> tuple:
+    """The path with these rates at its ends and `mean` between them. Diffrax's own cubic takes the last stage for the
+    slope at the end, which it is not where the first stage is not the last of the step before: a ball would leave the
+    floor with another velocity than it has there."""
+    second = plus(times(3.0, mean), times(-1.0, plus(times(2.0, rate0), rate1)))
+    third = plus(plus(rate0, rate1), times(-2.0, mean))
     second, third = shared([second, third])
-    return (q0, times(h, v0), times(h, second), times(h, third)), (v0, times(2.0, second), times(3.0, third))
+    return q0, times(h, rate0), times(h, second), times(h, third)
+
+
+def _quadratic(v0: Any, step: Any, v1: Any) -> tuple:
+    """What begins at v0 with the slope `step` and ends at v1."""
+    return v0, step, plus(v1, times(-1.0, plus(v0, step)))
 
 
 def interpolation_weights(solver: Any) -> np.ndarray:
@@ -235,7 +242,7 @@ def interpolation_weights(solver: Any) -> np.ndarray:
     raise ValueError(f"Argument `solver` must have a polynomial interpolant, but got {solver}; try diffrax.Tsit5().")
 
 
-def _fitted_arc(path: Any, z0: Any, time: Any, h: Any) -> Arc:
+def _fitted_arc(path: Any, z0: Any, time: Any, state: Any, h: Any) -> Arc:
     """An arc through samples of any interpolation class: linear for solvers that interpolate so, else quintic."""
     degree = 1 if isinstance(path, diffrax.LocalLinearInterpolation) else 5
     nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(degree) + 1) / degree)
@@ -247,4 +254,4 @@ def _fitted_arc(path: Any, z0: Any, time: Any, h: Any) -> Arc:
         return (start, *[_combination(row, rises) for row in inverse])
 
     q, v = jax.tree.map(fit, z0, *samples)
-    return Arc(time, q, v, jnp.ones_like(h), h)
+    return Arc(time, state, q, v, jnp.ones_like(h), h)

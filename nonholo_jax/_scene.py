@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 
 from ._air import Air
-from ._ball import Ball, BallState
+from ._ball import Ball, BallState, check_ball_state
 from ._polynomial import Window
 from ._rotation import turned
 from ._shared import shared
 from ._surface import AbstractSurface
-from ._system import AbstractSystem, rounding
+from ._system import AbstractSystem, bounces, rounding
 from ._types import Vector3
 from ._vector import (
     add,
@@ -102,21 +102,27 @@ class Scene(AbstractSystem):
     def evolving(self, state: Flight) -> tuple:
         return state.position, state.velocity
 
-    def uniform_acceleration(self):
-        return components(self.gravity) if self.air is None else None
+    def is_uniform(self):
+        return self.air is None
 
-    def acceleration(self, time, state, q, v):
+    def derivative(self, time, state, q, v):
         g = components(self.gravity)
-        return g if self.air is None else add(g, self.air.acceleration(self.ball, v, state.spin))
+        return v, g if self.air is None else add(g, self.air.acceleration(self.ball, v, state.spin))
 
-    def advanced(self, state, q, v, duration):
+    def advanced(self, time, state, q, v, duration):
         orientation = state.orientation
         if orientation is not None:  # the spin is constant in flight, so that the rotation is exact
             angle = jnp.stack([jnp.asarray(w * duration, dtype=orientation.dtype) for w in state.spin])
             orientation = turned(orientation, angle)
         return Flight(q, v, state.spin, orientation)
 
-    def impact(self, contact, time, state):
+    def follows(self, contact, time, state, left, rests):
+        return bounces(rests)
+
+    def phase(self, state):
+        return jnp.asarray(-1, dtype=jnp.int32)
+
+    def impact(self, contact, time, state, kind):
         """Theorem 5.2 for any normal and any law."""
         ball, x = self.ball, state.position
         n = shared(select_vector(contact, [surface.direction(x, time) for surface in self.surfaces]))
@@ -131,15 +137,15 @@ class Scene(AbstractSystem):
         kick = add(scale(rebound, n), scale(s, slip))
         twist = times(s, ratio(1.0, times(ball.inertia_ratio, ball.radius)))
         spin = add(state.spin, scale(twist, cross(n, tuple(slip))))
-        return Flight(x, subtract(state.velocity, kick), spin, state.orientation)
+        return Flight(x, subtract(state.velocity, kick), spin, state.orientation), 0.0
 
-    def level(self, contact, time, q):
+    def level(self, contact, time, q, state):
         return self.surfaces[contact].level(q, time, self.ball.radius)
 
     def reach(self, contact, q):
         return self.surfaces[contact].reach(q, self.ball.radius)
 
-    def bend(self, contact, time, window: Window):
+    def bend(self, contact, time, window: Window, state):
         return self.surfaces[contact].bend(window, time, self.ball.radius)
 
     def is_bounded(self, contact):
@@ -155,11 +161,15 @@ class Scene(AbstractSystem):
         for i, surface in enumerate(self.surfaces):
             checks = [*surface.is_proper(self.ball.radius), *surface.law.admissible()]
             holds += [jnp.asarray(check) for check, _ in checks]
-            depth = self.level(i, time, state.position) + 16.0 * rounding(self, i, state.position)
+            depth = self.level(i, time, state.position, state) + 16.0 * rounding(self, i, state.position)
             holds.append(jnp.asarray(depth >= 0))
         return jnp.all(jnp.stack(holds))
 
-    def unpacked(self, state: BallState) -> Flight:
+    def received(self, state, batch):
+        check_ball_state(state, batch)
+        return state
+
+    def unpacked(self, state: BallState, phase=None) -> Flight:
         dtype = state.position.dtype
         parts = [components(x.astype(dtype)) for x in (state.position, state.velocity, state.spin)]
         orientation = state.orientation

@@ -8,7 +8,6 @@ import jax
 import jax.core
 import jax.numpy as jnp
 
-from ._ball import BallState
 from ._loop import run
 from ._motion import AbstractMotion, Exact
 from ._motion_integrated import Integrated
@@ -64,7 +63,7 @@ def simulate(
     ```
     """
     motion, log_rows = checked(scene, motion, max_impacts, log_size)
-    _check_shapes(state, batch=False)
+    state = scene.received(state, batch=False)
     dtype = jax.tree.leaves(state)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)
@@ -107,7 +106,7 @@ def simulate_batch(
     ```
     """
     motion, log_rows = checked(scene, motion, max_impacts, log_size)
-    _check_shapes(states, batch=True)
+    states = scene.received(states, batch=True)
     dtype = jax.tree.leaves(states)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)
@@ -210,31 +209,11 @@ def checked(scene: Any, motion: Any, max_impacts: int, log_size: int | None) -> 
             raise ValueError(f"Argument `{name}` must be a whole number of at least 0, but got {value!r}; try 64.")
     if motion is None:
         bounded = all(scene.is_bounded(i) for i in range(scene.n_contacts))
-        motion = Exact() if scene.uniform_acceleration() is not None and bounded else Integrated()
+        motion = Exact() if scene.is_uniform() and bounded else Integrated()
     if not isinstance(motion, AbstractMotion):
         raise ValueError(f"Argument `motion` must be None, Exact() or Integrated(), but got {motion!r}; try None.")
     motion.check(scene)
     return motion, max_impacts if log_size is None else log_size
-
-
-def _check_shapes(state: Any, batch: bool) -> None:
-    if not isinstance(state, BallState):
-        raise ValueError(f"Argument `state` must be a BallState, but got {type(state).__name__}; try BallState(...).")
-    names = [("position", 3), ("velocity", 3), ("spin", 3), ("orientation", 4)]
-    sizes = set()
-    for name, n in names:
-        x = getattr(state, name, None)
-        if x is None:
-            continue
-        want = f"(N, {n})" if batch else f"({n},)"
-        if x.ndim != (2 if batch else 1) or x.shape[-1] != n:
-            other = "simulate() for one state" if batch else "simulate_batch() or vmap for a batch"
-            raise ValueError(f"Argument `state.{name}` must have shape {want}, but got {x.shape}; try {other}.")
-        sizes.add(x.shape[0] if batch else 1)
-    if len(sizes) > 1:
-        raise ValueError(
-            f"Argument `states` must have one batch size, but got {sorted(sizes)}; try jnp.broadcast_to on the shorter."
-        )
 
 
 def _check_times(t0: Any, t1: Any) -> None:

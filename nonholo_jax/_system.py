@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from ._polynomial import Interval, Window
-from ._types import Index, Number, Scalar
+from ._types import KINDS, RESULTS, Index, Number, Scalar
 from ._vector import is_constant, plus, times, total
 
 
@@ -22,34 +22,44 @@ class AbstractSystem(eqx.Module):
 
     @abstractmethod
     def evolving(self, state: Any) -> tuple[tuple[Number, ...], tuple[Number, ...]]:
-        """The configuration that gaps see, and its rate: two tuples of n scalars."""
+        """The configuration that gaps see, and its velocity: two tuples of scalars."""
 
     @abstractmethod
-    def uniform_acceleration(self) -> tuple[Number, ...] | None:
-        """The acceleration of the configuration where it is constant, else `None`: the arcs are then not parabolas."""
+    def derivative(self, time: Scalar, state: Any, q: tuple, v: tuple) -> tuple[tuple[Number, ...], tuple[Number, ...]]:
+        """The rates of q and of v on the arc that begins at `state`."""
 
     @abstractmethod
-    def acceleration(self, time: Scalar, state: Any, q: tuple, v: tuple) -> tuple[Number, ...]:
-        """The acceleration of the configuration."""
+    def is_uniform(self) -> bool:
+        """Whether on every arc v is the rate of q and has a constant rate itself: arcs are then parabolas."""
 
     @abstractmethod
-    def advanced(self, state: Any, q: tuple, v: tuple, duration: Number) -> Any:
-        """The state after smooth motion to (q, v) during `duration` seconds."""
+    def advanced(self, time: Scalar, state: Any, q: tuple, v: tuple, duration: Number) -> Any:
+        """The state at `time`, after smooth motion from `state` to (q, v) during `duration` seconds."""
 
     @abstractmethod
-    def impact(self, contact: Index, time: Scalar, state: Any) -> Any:
-        """The state after an impact on the contact of that index."""
+    def follows(self, contact: Index, time: Scalar, state: Any, left: Scalar, rests: Any) -> tuple[KINDS, RESULTS]:
+        """What follows when a contact is crossed in `state`, `left` seconds before the end, and whether the motion can
+        go on (`RESULTS.reached_t1`) or why not. `rests` says that a bounce would not rise above rounding."""
 
     @abstractmethod
-    def level(self, contact: int, time: Scalar, q: tuple) -> Number:
-        """Positive apart, zero at contact, negative beyond; there its derivative is that of the gap in metres."""
+    def impact(self, contact: Index, time: Scalar, state: Any, kind: KINDS) -> tuple[Any, Scalar | float]:
+        """The state after crossing a contact, given what follows, and how many seconds have passed by then."""
+
+    @abstractmethod
+    def phase(self, state: Any) -> Index:
+        """Which motion a state is in: -1 if free, else the index of the contact that it stays on."""
+
+    @abstractmethod
+    def level(self, contact: int, time: Scalar, q: tuple, state: Any) -> Number:
+        """Positive apart, zero at contact, negative beyond; there its derivative is that of the gap in metres. `state`
+        is the one at which the arc began."""
 
     @abstractmethod
     def reach(self, contact: int, q: tuple) -> Number | None:
         """A length over which `bend` is worth asking for; `None` if it is as good over the whole arc."""
 
     @abstractmethod
-    def bend(self, contact: int, time: Scalar, window: Window) -> Interval:
+    def bend(self, contact: int, time: Scalar, window: Window, state: Any) -> Interval:
         """Bounds of the second derivative of the level along the window."""
 
     @abstractmethod
@@ -65,8 +75,12 @@ class AbstractSystem(eqx.Module):
         """Whether the motion can start there."""
 
     @abstractmethod
-    def unpacked(self, state: Any) -> Any:
-        """The engine's form of a user's state: a pytree of scalars, all of one dtype."""
+    def received(self, state: Any, batch: bool) -> Any:
+        """A user's state (or a batch of them) as arrays. Raises `ValueError` for what cannot be right."""
+
+    @abstractmethod
+    def unpacked(self, state: Any, phase: Index | None = None) -> Any:
+        """The engine's form of a user's state, in the free phase or a given one: a pytree of scalars of one dtype."""
 
     @abstractmethod
     def packed(self, state: Any) -> Any:
@@ -74,11 +88,17 @@ class AbstractSystem(eqx.Module):
 
     @abstractmethod
     def contact_frame(self, contact: Index, time: Scalar, state: Any) -> tuple[Array, Array]:
-        """The point of contact and the unit normal there."""
+        """The point of contact and the gradient of the gap there."""
 
     @abstractmethod
     def without_contacts(self) -> "AbstractSystem":
         """The same system with nothing to hit."""
+
+
+def bounces(rests: Any) -> tuple[KINDS, RESULTS]:
+    """What follows an impact where nothing but a bounce can: `follows` of a system without other phases."""
+    kind = KINDS.where(rests, KINDS.unused, KINDS.bounce)
+    return kind, RESULTS.where(rests, RESULTS.sustained_contact, RESULTS.reached_t1)
 
 
 def rounding(system: AbstractSystem, contact: int, q: Sequence[Number]) -> Number:

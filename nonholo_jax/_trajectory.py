@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._loop import Outcome, run, unpack_row
+from ._loop import Outcome, kind_of, run, unpack_row
 from ._motion import AbstractMotion
 from ._system import AbstractSystem
 from ._types import KINDS, RESULTS
@@ -20,15 +20,17 @@ class ImpactLog(eqx.Module):
     axis, if any); rows that are not used hold NaN, and -1 in `surface`.
 
     - `time` in s, and `duration` in s of the arc before.
+    - `until`: the time in s at which `after` holds: that of the impact, or the end of a train.
     - `surface`: index in the order of the scene.
     - `point` of contact in m, and unit `normal` from the surface to the ball.
     - `before`, `after`: the state on either side of the impact; the positions are equal.
-    - `kind`: one of `KINDS`.
+    - `kind`: one of `KINDS`; `support`: index of the surface that the ball stays on afterwards, -1 if it flies.
     - `grazing`: True where the closing speed is below sqrt(eps) of the speed: the time of such an impact, and its
         derivatives, are those of the branch taken, and ill-conditioned.
     """
 
     time: Float[Array, "*batch log"]
+    until: Float[Array, "*batch log"]
     duration: Float[Array, "*batch log"]
     surface: Int[Array, "*batch log"]
     point: Float[Array, "*batch log d"]
@@ -36,6 +38,7 @@ class ImpactLog(eqx.Module):
     before: Any
     after: Any
     kind: KINDS
+    support: Int[Array, "*batch log"]
     grazing: Bool[Array, "*batch log"]
 
 
@@ -93,24 +96,25 @@ def _at_one(trajectory: Trajectory, t: Any) -> Any:
     system, log = trajectory.system, trajectory.impacts
     rows = log.time.shape[0]
     end = trajectory.t1
-    start, begin = trajectory.initial, trajectory.t0
+    start, begin, phase = trajectory.initial, trajectory.t0, jnp.asarray(-1, dtype=jnp.int32)
     if rows > 0:
         n = jnp.minimum(trajectory.n_impacts, rows)
-        past = jnp.sum((log.time <= t) & (jnp.arange(rows, dtype=n.dtype) < n))
+        past = jnp.sum((log.until <= t) & (jnp.arange(rows, dtype=n.dtype) < n))
         row = jnp.maximum(past - 1, 0)
         start = jax.tree.map(lambda a, b: jnp.where(past > 0, a[row], b), log.after, start)
-        begin = jnp.where(past > 0, log.time[row], begin)
+        begin = jnp.where(past > 0, log.until[row], begin)
+        phase = jnp.where(past > 0, log.support[row], phase)
         end = jnp.where(trajectory.n_impacts > rows, log.time[rows - 1], end)
     else:
         end = jnp.where(trajectory.n_impacts > 0, trajectory.t0, end)
     inside = (t >= trajectory.t0) & (t <= end)
     free = system.without_contacts()
     until = jnp.where(inside, t, begin)
-    state, motion = free.unpacked(start), trajectory.motion
+    state, motion = free.unpacked(start, phase), trajectory.motion
     if motion.is_closed_form:
         piece = motion.piece(free, begin, state, None, jnp.asarray(True), until - begin)
         arc, s = piece.arc, piece.arc.length
-        end_state = free.advanced(state, arc.position(s), arc.velocity(s), s * arc.unit)
+        end_state = free.advanced(until, state, arc.position(s), arc.velocity(s), s * arc.unit)
         end_state = jax.tree.map(lambda x: jnp.asarray(x, dtype=t.dtype), end_state)
     else:
         end_state = run(free, motion, state, begin, until, max_impacts=0, log_rows=0).state
@@ -119,7 +123,8 @@ def _at_one(trajectory: Trajectory, t: Any) -> Any:
 
 def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any, outcome: Outcome) -> Trajectory:
     """The user's form of an outcome."""
-    values, contact = outcome.log.values, outcome.log.contact
+    values = outcome.log.values
+    contact, code, support = (outcome.log.labels[:, i] for i in range(3))
     row = unpack_row(values, outcome.state)
     used = contact >= 0
     safe = jax.tree.map(jnp.nan_to_num, frozen(outcome.state))  # harmless numbers for the rows that are not used
@@ -128,13 +133,15 @@ def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any
         point, normal = jax.vmap(system.contact_frame)(contact, row.time, before)
         point, normal = (jnp.where(used[:, None], x, jnp.nan) for x in (point, normal))
     else:
-        point = normal = jnp.full((contact.shape[0], 3), jnp.nan, t0.dtype)
+        point = normal = jnp.full((contact.shape[0], len(system.evolving(outcome.state)[0])), jnp.nan, t0.dtype)
     packed_before, packed_after = jax.vmap(system.packed)(row.before), jax.vmap(system.packed)(row.after)
-    closing = jnp.abs(jnp.sum(normal * _velocity(system, row.before, normal.shape[-1]), axis=-1))
-    speed = jnp.sqrt(jnp.sum(frozen(_velocity(system, row.before, normal.shape[-1])) ** 2, axis=-1))
+    rate = frozen(jax.vmap(lambda time, state: _rate(system, time, state))(row.time, before))
+    closing, speed = jnp.abs(jnp.sum(normal * rate, axis=-1)), jnp.sqrt(jnp.sum(rate**2, axis=-1))
     grazing = used & (closing <= float(jnp.finfo(t0.dtype).eps) ** 0.5 * speed)
-    kind = jax.vmap(lambda each: KINDS.where(each, KINDS.bounce, KINDS.unused))(used)
-    log = ImpactLog(row.time, row.duration, contact, point, normal, packed_before, packed_after, kind, grazing)
+    log = ImpactLog(
+        row.time, row.until, row.duration, contact, point, normal, packed_before, packed_after,
+        kind_of(jnp.maximum(code, 0)), support, grazing,
+    )  # fmt: skip
     return Trajectory(
         final=system.packed(outcome.state),
         t1=outcome.time,
@@ -153,5 +160,7 @@ def _along(used: Any, x: Any) -> Any:
     return used.reshape(used.shape + (1,) * (x.ndim - used.ndim))
 
 
-def _velocity(system: AbstractSystem, states: Any, n: int) -> Any:
-    return jax.lax.stop_gradient(jnp.stack(system.evolving(states)[1], axis=-1)[..., :n])
+def _rate(system: AbstractSystem, time: Any, state: Any) -> Any:
+    """dq/dt of one state."""
+    rate, _ = system.derivative(time, state, *system.evolving(state))
+    return jnp.stack([jnp.asarray(x, dtype=time.dtype) for x in rate])
