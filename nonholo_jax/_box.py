@@ -1,6 +1,7 @@
 """Boxes and rectangles: a ball that touches one has its centre on a box with rounded edges and corners."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +12,7 @@ import numpy as np
 from ._law import AbstractContactLaw
 from ._polynomial import Interval, Window, square
 from ._rotation import matrix
-from ._surface import AbstractSurface, check, nonzero, positive
+from ._surface import AbstractSurface, Face, check, nonzero, positive
 from ._types import Number, Vector3
 from ._vector import (
     add,
@@ -28,6 +29,8 @@ from ._vector import (
     plus,
     ratio,
     scale,
+    select,
+    select_vector,
     subtract,
     times,
     total,
@@ -56,6 +59,8 @@ def _box_level(y: Vector3, half: Vector3, radius: Number) -> Number:
 def _box_bend(window: Window, axes: tuple, center: Vector3, half: Vector3, radius: Number) -> Interval:
     """The sum of the clipped squares' second derivatives, each v^2 + e a where e > 0 and 0 elsewhere, over r."""
     lows, highs = [], []
+    dtype = jnp.result_type(*[c for p in window.coefficients for c in p if not is_constant(c)] or [float])
+    eps = 32.0 * float(jnp.finfo(dtype).eps)
     for axis, h in zip(axes, half, strict=True):
         value, rate, bend = window.along(axis, center)
         farthest = maximum(plus(maximum(value.high, times(-1.0, value.low)), times(-1.0, h)), 0.0)
@@ -65,7 +70,10 @@ def _box_bend(window: Window, axes: tuple, center: Vector3, half: Vector3, radiu
         away = where_number(right, bend.high, where_number(left, times(-1.0, bend.low), either))
         back = where_number(right, times(-1.0, bend.low), where_number(left, bend.high, either))
         squares = square(rate)
-        lows.append(minimum(plus(squares.low, times(-1.0, times(farthest, maximum(back, 0.0)))), 0.0))
+        bend_low = plus(squares.low, times(-1.0, times(farthest, maximum(back, 0.0))))
+        # Beyond the edge all along, to rounding: a ball that rolls off must not seem to fall back.
+        nearest, slack = maximum(value.low, times(-1.0, value.high)), times(eps, plus(h, abs(dot(axis, center))))
+        lows.append(where_number(plus(nearest, slack) >= h, bend_low, minimum(bend_low, 0.0)))
         highs.append(where_number(farthest > 0, plus(squares.high, times(farthest, maximum(away, 0.0))), 0.0))
     return Interval(ratio(total(lows), radius), ratio(total(highs), radius))
 
@@ -123,6 +131,20 @@ class _AbstractBlock(AbstractSurface):
         return plus(norm(components(self.center)), norm(components(self.half_size)))
 
 
+def _face(x: Vector3, center: Vector3, half: Vector3, axes: tuple, choices: Sequence[int]) -> Face:
+    """The face that a point is farthest beyond, of those across the axes `choices`."""
+    y = _in_frame(x, center, axes)
+    beyond = _excess(y, half)
+    best = jnp.argmax(jnp.stack([jnp.asarray(beyond[k]) for k in choices]))
+    side = select(best, [where_number(y[k] < 0, -1.0, 1.0) for k in choices])
+    normal = scale(side, select_vector(best, [axes[k] for k in choices]))
+    first, second = ([(k + i) % 3 for k in choices] for i in (1, 2))
+    tangents = tuple(select_vector(best, [axes[k] for k in each]) for each in (first, second))
+    sizes = tuple(select(best, [half[k] for k in each]) for each in (first, second))
+    below = select(best, [jnp.where(beyond[i] + beyond[j] > 0, 0.0, 1.0) for i, j in zip(first, second, strict=True)])
+    return Face(normal, center, tangents, sizes, below > 0.5)  # pyright: ignore
+
+
 class Box(_AbstractBlock):
     """A solid box with faces, edges and corners: a table top, a step, a brick.
 
@@ -150,6 +172,10 @@ class Box(_AbstractBlock):
     def distance(self, x, t):
         center, half, axes = self._frame()
         return _box_distance(_in_frame(x, center, axes), half)
+
+    def face(self, x, t):
+        center, half, axes = self._frame()
+        return _face(x, center, half, axes, (0, 1, 2))
 
     def is_proper(self, radius):
         return [positive("half_size", h) for h in components(self.half_size)]
@@ -189,6 +215,10 @@ class Rectangle(_AbstractBlock):
     def distance(self, x, t):
         center, half, axes = self._frame()
         return norm(_excess(_in_frame(x, center, axes), half))
+
+    def face(self, x, t):
+        center, half, axes = self._frame()
+        return _face(x, center, half, axes, (2,))
 
     def is_proper(self, radius):
         n, raw = components(self.facing), components(self.tangent)

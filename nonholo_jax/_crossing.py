@@ -79,13 +79,18 @@ def _here(arc: Arc, s: Any) -> _Here:
     return _Here(s, coefficients, tuple(evaluate(tuple(abs(c) for c in p), s) for p in arc.configuration))
 
 
+def _is_exact(system: AbstractSystem, contact: int, here: _Here) -> bool:
+    """Whether the level along the path is a parabola, so that one step ends at its zero."""
+    return system.reach(contact, here.position) is None and all(len(p) <= 3 for p in here.coefficients)
+
+
 def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, window: Any, touching: Any) -> _Step:
     s, coefficients, size = here
     left = arc.length - s
     value, rate = slope(lambda x: system.level(contact, arc.time, x, arc.start), here.position, here.tangent)
     tolerance = rounding(system, contact, size)
     reach = system.reach(contact, here.position)
-    exact = reach is None and all(len(p) <= 3 for p in coefficients)
+    exact = _is_exact(system, contact, here)
     width = left
     if reach is not None:
         bends = [times(2.0, p[2]) if len(p) > 2 else 0.0 for p in coefficients]
@@ -93,12 +98,14 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, wind
         width = jnp.where(speed * left > 2.0 * reach, 2.0 * reach / jnp.where(speed > 0, speed, 1.0), left)
     if not exact:  # the reach is a first guess; from then on the window knows better
         width = jnp.where(jnp.isinf(window), width, jnp.minimum(left, window))
+    # A contact that has just been left has a gap of exactly zero that does not close; rounding may not say otherwise.
+    left_behind = touching & (s == 0)
+    if not exact:  # where it opens from rest, at an edge that is rolled over, only a close look sees that it opens
+        width = jnp.where(left_behind & (rate <= 0), 1e-7 * width, width)
     bend = system.bend(contact, arc.time, Window(coefficients, width), arc.start)
     m, most = (jnp.asarray(x, dtype=arc.time.dtype) for x in bend)
     value, rate, m, most, width = shared([value, rate, m, most, width])
 
-    # A contact that has just been left has a gap of exactly zero that does not close; rounding may not say otherwise.
-    left_behind = touching & (s == 0)
     value = jnp.where(left_behind, 0.0, jnp.maximum(value, 0.0))
     rate = jnp.where(left_behind, jnp.maximum(rate, 0.0), rate)
     disc = rate * rate - 2.0 * m * value
@@ -158,7 +165,8 @@ class Meeting(NamedTuple):
 
     value: Scalar
     rate: Scalar
-    rests: Bool[Array, ""]  # a bounce would not rise above rounding: the motion stays in contact
+    rests: Bool[Array, ""]  # a bounce would not rise above rounding
+    ends: Bool[Array, ""]  # nor could it be computed: the motion stays in contact
 
 
 def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meeting:
@@ -167,9 +175,14 @@ def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meet
     for i in range(system.n_contacts):
         value, rate = slope(lambda x, i=i: system.level(i, arc.time, x, arc.start), here.position, here.tangent)
         bend = system.bend(i, arc.time, Window(here.coefficients, 0.0), arc.start)
-        columns.append((value, rate, bend.low, rounding(system, i, here.size)))
-    value, rate, bend, tolerance = shared([select(contact, column) for column in zip(*columns, strict=True)])
-    return Meeting(value, rate, (bend < 0) & (rate * rate <= -2.0 * bend * tolerance))  # pyright: ignore
+        flat = 1.0 if _is_exact(system, i, here) else 0.0
+        columns.append((value, rate, bend.low, rounding(system, i, here.size), flat))
+    value, rate, bend, tolerance, flat = [select(contact, column) for column in zip(*columns, strict=True)]
+    value, rate, bend, tolerance = shared([value, rate, bend, tolerance])
+    rests = (bend < 0) & (rate * rate <= -2.0 * bend * tolerance)
+    # On a plane a bounce of any height is computed, down to the rounding of the velocity itself.
+    noise = 16.0 * float(jnp.finfo(s.dtype).eps) * norm(here.tangent)
+    return Meeting(value, rate, rests, rests & (jnp.asarray(flat < 0.5) | (jnp.abs(rate) <= noise)))  # pyright: ignore
 
 
 def newton(arc: Arc, s: Scalar, value: Number, rate: Number) -> Scalar:

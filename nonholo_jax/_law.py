@@ -2,6 +2,7 @@
 velocity by 1 + e_n and of the slip by s, so that a law is just the pair (e_n, s)."""
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import equinox as eqx
 
@@ -16,6 +17,12 @@ class AbstractContactLaw(eqx.Module):
     """
 
     restitution: eqx.AbstractVar[Number]
+    rolls: ClassVar[bool | None] = None
+    """What a ball does after its last bounce: roll (True), slide freely (False), or nothing that is modelled."""
+
+    def reversal(self) -> Number | None:
+        """The share e_t of its slip that every impact reverses, however slow; `None` where it depends on the impact."""
+        return None
 
     @abstractmethod
     def slip_factor(self, inertia_ratio: Number, closing_speed: Number, slip_squared: Number) -> Number:
@@ -66,9 +73,13 @@ class Rough(AbstractContactLaw):
 
     restitution: Number = eqx.field(converter=as_number, default=1.0)
     tangential: Number | None = eqx.field(converter=as_number, default=None)
+    rolls: ClassVar[bool | None] = True
 
     def __check_init__(self):
         _reject_outside(self)
+
+    def reversal(self) -> Number:
+        return self.restitution if self.tangential is None else self.tangential
 
     def admissible(self) -> list:
         checks = super().admissible()
@@ -77,8 +88,7 @@ class Rough(AbstractContactLaw):
         return checks
 
     def slip_factor(self, inertia_ratio: Number, closing_speed: Number, slip_squared: Number) -> Number:
-        e_t = self.restitution if self.tangential is None else self.tangential
-        return times(1 + e_t, _grip(inertia_ratio))
+        return times(1 + self.reversal(), _grip(inertia_ratio))
 
 
 class Smooth(AbstractContactLaw):
@@ -94,9 +104,13 @@ class Smooth(AbstractContactLaw):
     """
 
     restitution: Number = eqx.field(converter=as_number, default=1.0)
+    rolls: ClassVar[bool | None] = False
 
     def __check_init__(self):
         _reject_outside(self)
+
+    def reversal(self) -> Number:
+        return -1.0
 
     def slip_factor(self, inertia_ratio: Number, closing_speed: Number, slip_squared: Number) -> Number:
         return 0.0

@@ -172,10 +172,10 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     ended = kept & finished
     crossed = ended & (found.contact >= 0)
     through = ended & ~crossed
-    s, resting = jnp.where(through, arc.length, found.s), jnp.asarray(False)
+    s, resting, ends = jnp.where(through, arc.length, found.s), jnp.asarray(False), jnp.asarray(False)
     if system.n_contacts > 0:
         met = meeting(system, arc, found.s, found.contact)
-        s, resting = jnp.where(crossed, newton(arc, s, met.value, met.rate), s), met.rests
+        s, resting, ends = jnp.where(crossed, newton(arc, s, met.value, met.rate), s), met.rests, met.ends
         (s,) = shared([s])
     elapsed = s * arc.unit
     reached = through & last
@@ -185,12 +185,14 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
 
     since = c.since + elapsed
     at_once = since * norm(frozen(arc.tangent(s))) <= _tiny(arc, s) * arc.unit
-    n_at_once = jnp.where(at_once & (c.n_impacts > 0), c.n_at_once + 1, 0)
+    same = found.contact == c.touching  # bounces on one surface die out, they are no corner
+    n_at_once = jnp.where(at_once & (c.n_impacts > 0) & ~same, c.n_at_once + 1, 0)
     full = c.n_impacts >= max_impacts
     stuck = n_at_once > _MOST_IMPACTS_AT_ONCE
-    kind, fault, after, pause = KINDS.unused, RESULTS.reached_t1, arrived, 0.0
+    kind, fault, after, pause, name = KINDS.unused, RESULTS.reached_t1, arrived, 0.0, found.contact
     if system.n_contacts > 0:
-        kind, fault = system.follows(found.contact, time, arrived, t1 - time, resting)
+        name = system.named(found.contact, arrived)
+        kind, fault = system.follows(found.contact, time, arrived, t1 - time, resting, ends)
         after, pause = system.impact(found.contact, time, arrived, kind)
         after = _arrays(after, t1.dtype)
     failed = fault != RESULTS.reached_t1
@@ -198,25 +200,27 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     stopped, crossed = _shared_flags((stopped, crossed))
     struck = crossed & ~stopped
     until = time + pause
-    labels = jnp.stack([found.contact, _code(kind), system.phase(after)])
+    settled = struck & system.is_at_rest(arrived, after)
+    labels = jnp.stack([name, _code(kind), system.phase(after)])
     log = Log(
         _write(c.log.values, c.n_impacts, struck & ~c.done, pack_row(Row(time, until, since, arrived, after))),
         _write(c.log.labels, c.n_impacts, struck & ~c.done, labels),
     )
     path = Path(
         _write(c.path.sizes, c.n_arcs, ended & ~c.done, frozen(jnp.stack([jnp.where(last, jnp.inf, length), s]))),
-        _write(c.path.labels, c.n_arcs, ended & ~c.done, labels[:2]),
+        _write(c.path.labels, c.n_arcs, ended & ~c.done, jnp.stack([found.contact, labels[1]])),
     )
 
     result = RESULTS.where(crossed & full, RESULTS.max_impacts, c.result)
     result = RESULTS.where(crossed & stuck, RESULTS.corner, result)
     result = RESULTS.where(crossed & failed, fault, result)
+    result = RESULTS.where(settled, RESULTS.at_rest, result)
     broken = ended & ~jnp.isfinite(time + sum(arrived_leaf.sum() for arrived_leaf in jax.tree.leaves(arrived)))
     (broken,) = _shared_flags((broken,))
     result = RESULTS.where(broken, RESULTS.invalid_state, result)
     n_arcs = c.n_arcs + ended.astype(jnp.int32)
     exhausted = (c.n_turns + 1 >= motion.max_turns(max_impacts)) | (n_arcs >= motion.max_pieces(max_impacts))
-    exhausted = exhausted & ~(reached | stopped | broken)
+    exhausted = exhausted & ~(reached | stopped | settled | broken)
     result = RESULTS.where(exhausted, RESULTS.step_limit, result)
     new = c._replace(
         time=jnp.where(struck, until, jnp.where(ended, time, c.time)),
@@ -224,7 +228,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
         memory=_keep(ended, piece.memory, c.memory),
         s=jnp.where(kept & ~ended, frozen(found.s), 0.0),
         window=jnp.where(kept & ~ended, frozen(found.window), jnp.inf),
-        touching=jnp.where(struck, found.contact, jnp.where(through, -1, c.touching)),
+        touching=jnp.where(struck, name, jnp.where(through, -1, c.touching)),
         jumped=jnp.where(ended, struck, c.jumped),
         control=_keep(ended | ~kept, control, c.control),
         since=jnp.where(struck, 0.0, jnp.where(ended, since, c.since)),
@@ -232,7 +236,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
         n_arcs=n_arcs,
         n_turns=c.n_turns + 1,
         n_at_once=jnp.where(struck, n_at_once, c.n_at_once),
-        done=reached | stopped | exhausted | broken,
+        done=reached | stopped | settled | exhausted | broken,
         result=result,
     )
     old = c._replace(log=log, path=path)

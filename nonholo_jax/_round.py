@@ -43,13 +43,13 @@ def _perpendicular(axis: Vector3) -> tuple[Vector3, Vector3]:
     return first, cross(axis, first)
 
 
-def _round_level(y: tuple, reach: Number, inside: bool) -> Number:
+def round_level(y: tuple, reach: Number, inside: bool) -> Number:
     """(|y|^2 - rho^2) / 2 rho, or its opposite inside: the second derivative is exact and cheap to bound."""
     outside = ratio(plus(dot(y, y), times(-1.0, times(reach, reach))), times(2.0, reach))
     return times(-1.0, outside) if inside else outside
 
 
-def _round_bend(window: Window, axes: tuple, origin: Vector3, reach: Number, inside: bool) -> Interval:
+def round_bend(window: Window, axes: tuple, origin: Vector3, reach: Number, inside: bool) -> Interval:
     tracks = [window.along(axis, origin) for axis in axes]
     terms = [*[square(track.rate) for track in tracks], *[product(track.value, track.bend) for track in tracks]]
     low, high = (ratio(total([getattr(term, end) for term in terms]), reach) for end in ("low", "high"))
@@ -90,14 +90,14 @@ class _AbstractRound(AbstractSurface):
         return functools.reduce(add, [scale(c, axis) for c, axis in zip(n, axes, strict=True)])
 
     def level(self, x, t, radius):
-        return _round_level(self._across(x), self._reach(radius), self.inside)
+        return round_level(self._across(x), self._reach(radius), self.inside)
 
     def reach(self, x, radius):
         return self._reach(radius) if self.inside else norm(self._across(x))
 
     def bend(self, window, t, radius):
         middle, axes = self._frame()
-        return _round_bend(window, axes, middle, self._reach(radius), self.inside)
+        return round_bend(window, axes, middle, self._reach(radius), self.inside)
 
     def extent(self):
         return plus(norm(self._frame()[0]), self.radius)

@@ -116,8 +116,17 @@ class Scene(AbstractSystem):
             orientation = turned(orientation, angle)
         return Flight(q, v, state.spin, orientation)
 
-    def follows(self, contact, time, state, left, rests):
-        return bounces(rests)
+    def follows(self, contact, time, state, left, rests, ends):
+        return bounces(ends)
+
+    def during(self, contact, time, state, elapsed):
+        return state
+
+    def named(self, contact, state):
+        return contact
+
+    def is_at_rest(self, before, after):
+        return jnp.asarray(False)
 
     def phase(self, state):
         return jnp.asarray(-1, dtype=jnp.int32)

@@ -8,9 +8,11 @@ import jax
 import jax.core
 import jax.numpy as jnp
 
+from ._grounded import grounded
 from ._loop import run
 from ._motion import AbstractMotion, Exact
 from ._motion_integrated import Integrated
+from ._scene import Scene
 from ._system import AbstractSystem
 from ._trajectory import Trajectory, packaged
 from ._types import is_failure, result_message, result_name
@@ -32,6 +34,7 @@ def simulate(
     max_impacts: int = 64,
     log_size: int | None = None,
     motion: AbstractMotion | None = None,
+    sum_trains: bool = True,
     adjoint: Any = None,
     throw: bool = True,
 ) -> Trajectory:
@@ -46,6 +49,9 @@ def simulate(
         `RESULTS.max_impacts`.
     - `log_size`: rows of the log; `None` for `max_impacts`, 0 for none.
     - `motion`: `Exact()` or `Integrated(...)`; `None` picks `Exact()` where the scene allows it, else `Integrated()`.
+    - `sum_trains`: bounces on a plane that die out before anything else can happen are summed in closed form, as one
+        row of the log, and the ball goes on rolling (on a `Smooth` surface, sliding). False gives every bounce, and
+        ends as `RESULTS.sustained_contact` where they have died out.
     - `adjoint`: how derivatives are taken. `None` finds the path without derivatives and repeats it with them, in
         both modes. `diffrax.ForwardMode()` differentiates the loop itself, forward only, first derivatives only.
         `diffrax.RecursiveCheckpointAdjoint()` likewise, reverse only.
@@ -63,12 +69,13 @@ def simulate(
     ```
     """
     motion, log_rows = checked(scene, motion, max_impacts, log_size)
+    system = _continued(scene, motion, sum_trains)
     state = scene.received(state, batch=False)
     dtype = jax.tree.leaves(state)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)
-    _check_scene(scene, _axes(scene, None))
-    trajectory = _run(scene, motion, state, t0, t1, max_impacts, log_rows, adjoint)
+    _check_scene(scene, tuple(_axes(scene, None)))
+    trajectory = _run(system, motion, state, t0, t1, max_impacts, log_rows, adjoint)
     return _raised(trajectory) if throw else trajectory
 
 
@@ -82,6 +89,7 @@ def simulate_batch(
     max_impacts: int = 64,
     log_size: int | None = None,
     motion: AbstractMotion | None = None,
+    sum_trains: bool = True,
     adjoint: Any = None,
     throw: bool = False,
 ) -> Trajectory:
@@ -106,16 +114,25 @@ def simulate_batch(
     ```
     """
     motion, log_rows = checked(scene, motion, max_impacts, log_size)
+    system = _continued(scene, motion, sum_trains)
     states = scene.received(states, batch=True)
     dtype = jax.tree.leaves(states)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)
-    _check_scene(scene, _axes(scene, scene_axes))
-    trajectory = _run_batch(scene, motion, states, t0, t1, scene_axes, max_impacts, log_rows, adjoint)
+    axes = tuple(_axes(scene, scene_axes))
+    _check_scene(scene, axes)
+    trajectory = _run_batch(system, motion, states, t0, t1, axes, max_impacts, log_rows, adjoint)
     return _raised(trajectory) if throw else trajectory
 
 
-def _check_scene(scene: Any, axes: list) -> None:
+def _continued(scene: AbstractSystem, motion: AbstractMotion, sum_trains: bool) -> AbstractSystem:
+    """The system with the motion after the last bounce, where there may be one."""
+    if not (sum_trains and isinstance(scene, Scene)):
+        return scene
+    return grounded(scene, float(getattr(motion, "atol", 0.0)))
+
+
+def _check_scene(scene: Any, axes: tuple) -> None:
     """Every number of a scene is one number, and every vector one vector, but for the axis that is mapped."""
     leaves = jax.tree_util.tree_flatten_with_path(scene)[0]
     for (path, leaf), axis in zip(leaves, axes, strict=True):
@@ -158,9 +175,8 @@ def _run(scene, motion, state, t0, t1, max_impacts: int, log_rows: int, adjoint)
 
 
 @eqx.filter_jit
-def _run_batch(scene, motion, states, t0, t1, scene_axes, max_impacts: int, log_rows: int, adjoint) -> Trajectory:
+def _run_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, log_rows: int, adjoint) -> Trajectory:
     scene = _cast(scene, t1.dtype)
-    axes = _axes(scene, scene_axes)
     leaves, treedef = jax.tree.flatten(scene)
     mapped = [leaf for leaf, axis in zip(leaves, axes, strict=True) if axis is not None]
     options = {"max_impacts": max_impacts, "log_rows": log_rows, "adjoint": adjoint}

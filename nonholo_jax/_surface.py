@@ -1,7 +1,7 @@
 """Surfaces: where they are, which way they face, and bounds that let a crossing be found without passing it."""
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,6 +27,16 @@ from ._vector import (
     total,
     unit,
 )
+
+
+class Face(NamedTuple):
+    """A flat piece of a surface, on which a ball can roll."""
+
+    normal: Vector3
+    center: Vector3
+    tangents: tuple[Vector3, Vector3]
+    half: tuple[Number, Number] | None  # half sizes along the tangents; `None` for a face without edges
+    below: Any  # whether the ball's centre is over it, not over an edge
 
 
 class AbstractSurface(eqx.Module):
@@ -66,6 +76,15 @@ class AbstractSurface(eqx.Module):
     @abstractmethod
     def is_proper(self, radius: Number) -> list:
         """Conditions on the surface for a ball of that radius, each a pair (bool, sentence)."""
+
+    def face(self, x: Vector3, t: Number) -> Face | None:
+        """The flat piece that a ball at `x` would roll on; `None` for a surface that has none."""
+        del x, t
+        return None
+
+    def clearance(self, x: Vector3, t: Number, radius: Number) -> Number:
+        """How far at least the centre of a ball at `x` can go in any direction before it touches, in m."""
+        return plus(self.distance(x, t), times(-1.0, radius))
 
     def is_bounded(self) -> bool:
         """Whether `bend` is a true bound, not an estimate from samples."""
@@ -128,6 +147,10 @@ class Plane(AbstractSurface):
 
     def direction(self, x, t):
         return unit(components(self.facing))
+
+    def face(self, x, t):
+        still = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        return Face(self.direction(x, t), components(self.point), still, None, True)
 
     def level(self, x, t, radius):
         return plus(self.distance(x, t), times(-1.0, radius))
@@ -196,6 +219,9 @@ class Implicit(AbstractSurface):
 
     def direction(self, x, t):
         return unit(self._gradient(x, t))
+
+    def clearance(self, x, t, radius):
+        return 0.0  # a gap with any slope tells no distance
 
     def level(self, x, t, radius):
         return self._value(x, t)

@@ -37,13 +37,28 @@ class AbstractSystem(eqx.Module):
         """The state at `time`, after smooth motion from `state` to (q, v) during `duration` seconds."""
 
     @abstractmethod
-    def follows(self, contact: Index, time: Scalar, state: Any, left: Scalar, rests: Any) -> tuple[KINDS, RESULTS]:
+    def follows(
+        self, contact: Index, time: Scalar, state: Any, left: Scalar, rests: Any, ends: Any
+    ) -> tuple[KINDS, RESULTS]:
         """What follows when a contact is crossed in `state`, `left` seconds before the end, and whether the motion can
-        go on (`RESULTS.reached_t1`) or why not. `rests` says that a bounce would not rise above rounding."""
+        go on (`RESULTS.reached_t1`) or why not. `rests` says that a bounce would not rise above rounding, `ends` that
+        it could not even be computed."""
 
     @abstractmethod
     def impact(self, contact: Index, time: Scalar, state: Any, kind: KINDS) -> tuple[Any, Scalar | float]:
         """The state after crossing a contact, given what follows, and how many seconds have passed by then."""
+
+    @abstractmethod
+    def during(self, contact: Index, time: Scalar, state: Any, elapsed: Scalar) -> Any:
+        """The state `elapsed` seconds after a contact was crossed in `state`, within the time that `impact` takes."""
+
+    @abstractmethod
+    def named(self, contact: Index, state: Any) -> Index:
+        """The contact that the log names, and that is touched afterwards: that itself, but for the edges of a face."""
+
+    @abstractmethod
+    def is_at_rest(self, before: Any, after: Any) -> Bool[Array, ""]:
+        """Whether nothing moves any more after an impact."""
 
     @abstractmethod
     def phase(self, state: Any) -> Index:
@@ -95,10 +110,10 @@ class AbstractSystem(eqx.Module):
         """The same system with nothing to hit."""
 
 
-def bounces(rests: Any) -> tuple[KINDS, RESULTS]:
+def bounces(ends: Any) -> tuple[KINDS, RESULTS]:
     """What follows an impact where nothing but a bounce can: `follows` of a system without other phases."""
-    kind = KINDS.where(rests, KINDS.unused, KINDS.bounce)
-    return kind, RESULTS.where(rests, RESULTS.sustained_contact, RESULTS.reached_t1)
+    kind = KINDS.where(ends, KINDS.unused, KINDS.bounce)
+    return kind, RESULTS.where(ends, RESULTS.sustained_contact, RESULTS.reached_t1)
 
 
 def rounding(system: AbstractSystem, contact: int, q: Sequence[Number]) -> Number:

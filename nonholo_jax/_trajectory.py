@@ -104,7 +104,7 @@ def _at_one(trajectory: Trajectory, t: Any) -> Any:
         start = jax.tree.map(lambda a, b: jnp.where(past > 0, a[row], b), log.after, start)
         begin = jnp.where(past > 0, log.until[row], begin)
         phase = jnp.where(past > 0, log.support[row], phase)
-        end = jnp.where(trajectory.n_impacts > rows, log.time[rows - 1], end)
+        end = jnp.where(trajectory.n_impacts > rows, log.until[rows - 1], end)
     else:
         end = jnp.where(trajectory.n_impacts > 0, trajectory.t0, end)
     inside = (t >= trajectory.t0) & (t <= end)
@@ -118,7 +118,22 @@ def _at_one(trajectory: Trajectory, t: Any) -> Any:
         end_state = jax.tree.map(lambda x: jnp.asarray(x, dtype=t.dtype), end_state)
     else:
         end_state = run(free, motion, state, begin, until, max_impacts=0, log_rows=0).state
+    if rows > 0:
+        summed, inner = _in_train(trajectory, past, n, t)
+        end_state = jax.tree.map(lambda a, b: jnp.where(summed, a, b), inner, end_state)
     return jax.tree.map(lambda x: jnp.where(inside, x, jnp.nan), system.packed(end_state))
+
+
+def _in_train(trajectory: Trajectory, past: Any, n: Any, t: Any) -> tuple[Any, Any]:
+    """Whether the time falls into the train that follows `past` rows of the log, and the state if it does."""
+    system, log = trajectory.system, trajectory.impacts
+    row = jnp.minimum(past, log.time.shape[0] - 1)
+    time = log.time[row]
+    summed = (past < n) & (time <= t) & (t < log.until[row])
+    before = jax.tree.map(lambda a, b: jnp.where(summed, a[row], b), log.before, trajectory.initial)
+    elapsed = jnp.where(summed, t - time, 0.0)
+    state = system.during(jnp.maximum(log.surface[row], 0), time, system.unpacked(before), elapsed)
+    return summed, jax.tree.map(lambda x: jnp.asarray(x, dtype=t.dtype), state)
 
 
 def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any, outcome: Outcome) -> Trajectory:

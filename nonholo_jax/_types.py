@@ -41,6 +41,10 @@ class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
         "Impacts at a corner did not resolve at one instant. Try moving the throw slightly off the corner, or round "
         "the corner off."
     )
+    pivoting = (
+        "The ball came to the edge of a face too slowly to fly off (v^2 < g r across the edge): it would tip over the "
+        "edge, which is not computed. Try more speed, an earlier `t1`, or `throw=False` and `Trajectory.t1`."
+    )
     sustained_contact = (
         "The ball stays in contact with a surface (it rests, rolls, or its bounces have died out below rounding). "
         "Try an earlier `t1`, or `throw=False` and `Trajectory.t1` for the time reached."
@@ -71,11 +75,10 @@ def result_message(result: RESULTS) -> str:
 
 
 class KINDS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
-    """What one row of an `ImpactLog` stands for. `train`, `rolling` and `left` are reserved for motion after the last
-    bounce, which this version ends as `RESULTS.sustained_contact`."""
+    """What one row of an `ImpactLog` stands for."""
 
     unused = "No impact in this row."
     bounce = "One impact."
-    train = "Infinitely many impacts that end in finite time."
-    rolling = "An impact after which the ball rolls."
-    left = "The ball leaves a surface without an impact."
+    train = "Infinitely many impacts that end in finite time; then the ball stays on the surface. One, if plastic."
+    rolling = "An impact after which the ball goes on along the surface that it was on, or comes to lie on one."
+    left = "The ball leaves a face over its edge, without an impact."

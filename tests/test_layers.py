@@ -28,6 +28,8 @@ ORDER = [
     "_round",
     "_air",
     "_scene",
+    "_train",
+    "_grounded",
     # motion
     "_crossing",
     "_motion",

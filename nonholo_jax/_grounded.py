@@ -1,0 +1,369 @@
+"""A scene in which bounces may die out: the ball then rolls on (or, where there is no friction, slides), meets walls,
+and leaves faces over their edges. Rolling is a phase of the same motion, on the same loop and in the same log."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from . import _train as train
+from ._rotation import rolled
+from ._round import round_bend, round_level
+from ._scene import Flight, Scene
+from ._surface import AbstractSurface, Face
+from ._system import AbstractSystem
+from ._types import KINDS, RESULTS, Number, Vector3
+from ._vector import (
+    add,
+    components,
+    cross,
+    dot,
+    is_constant,
+    minimum,
+    norm,
+    plus,
+    ratio,
+    scale,
+    select,
+    select_vector,
+    subtract,
+    times,
+    where_number,
+)
+
+
+class Travel(NamedTuple):
+    """A ball's state inside the engine, with the phase that it is in."""
+
+    flight: Flight
+    support: Any  # index of the surface that the ball stays on, -1 in flight; a float, as all of a state is
+
+
+def _can_settle(surface: AbstractSurface) -> bool:
+    """Whether a ball may roll or slide on a surface after its last bounce, as far as is known when it is traced."""
+    flat = type(surface).face is not AbstractSurface.face
+    elastic = is_constant(surface.law.restitution) and surface.law.restitution == 1
+    return flat and surface.law.rolls is not None and not elastic
+
+
+def _where(condition: Any, a: Sequence[Number], b: Sequence[Number]) -> Any:
+    return tuple(where_number(condition, x, y) for x, y in zip(a, b, strict=True))
+
+
+class Grounded(AbstractSystem):
+    """A scene with the motion after the last bounce. `tolerance` is the velocity in m/s that air may change during a
+    train that is summed."""
+
+    scene: Scene
+    tolerance: float = eqx.field(static=True)
+    hits: bool = eqx.field(static=True)
+
+    def __init__(self, scene: Scene, tolerance: float = 0.0, hits: bool = True):
+        self.scene, self.tolerance, self.hits = scene, tolerance, hits
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.scene.names
+
+    @property
+    def _floors(self) -> list[int]:
+        return [i for i, surface in enumerate(self.scene.surfaces) if _can_settle(surface)]
+
+    @property
+    def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The surfaces, and, where some of them have faces with edges, the two pairs of edges of the face below."""
+        edges = any(face.half is not None for face in self._faces((0.0, 0.0, 0.0), 0.0))
+        return (len(self.scene.surfaces) + 2 * edges) if self.hits else 0
+
+    def _faces(self, x: Vector3, time: Any) -> list[Face]:
+        faces = [self.scene.surfaces[i].face(x, time) for i in self._floors]
+        return [face for face in faces if face is not None]
+
+    def _face(self, index: Any, x: Vector3, time: Any) -> tuple[Face, Any]:
+        """The face below a ball on the surface of that index, and whether it has edges."""
+        faces = self._faces(x, time)
+        pick: Callable = lambda options: _pick(index, self._floors, options)  # noqa: E731
+        vector: Callable = lambda options: tuple(pick([o[k] for o in options]) for k in range(3))  # noqa: E731
+        half = [(1.0, 1.0) if face.half is None else face.half for face in faces]
+        face = Face(
+            vector([face.normal for face in faces]),
+            vector([face.center for face in faces]),
+            (vector([face.tangents[0] for face in faces]), vector([face.tangents[1] for face in faces])),
+            (pick([h[0] for h in half]), pick([h[1] for h in half])),
+            pick([jnp.where(face.below, 1.0, 0.0) for face in faces]) > 0.5,
+        )
+        return face, pick([0.0 if each.half is None else 1.0 for each in faces])
+
+    def _rolls(self, index: Any) -> Any:
+        flags = [1.0 if self.scene.surfaces[i].law.rolls else 0.0 for i in self._floors]
+        return jnp.asarray(_pick(index, self._floors, flags)) > 0.5
+
+    # Smooth motion
+
+    def evolving(self, state: Travel):
+        return self.scene.evolving(state.flight)
+
+    def is_uniform(self):
+        return self.scene.is_uniform()
+
+    def _rolling_spin(self, normal: Vector3, velocity: Vector3, spin: Vector3) -> Vector3:
+        """The spin without slip: (1.1) solved for the part along the surface. The part about the normal stays."""
+        return add(scale(ratio(1.0, self.scene.ball.radius), cross(normal, velocity)), scale(dot(normal, spin), normal))
+
+    def derivative(self, time, state, q, v):
+        flight, on = state.flight, state.support >= 0
+        face, _ = self._face(state.support, flight.position, time)
+        rolls = on & self._rolls(state.support)
+        if self.scene.air is not None:
+            spin = self._rolling_spin(face.normal, v, flight.spin)
+            flight = flight._replace(spin=_where(rolls, spin, flight.spin))
+        _, a = self.scene.derivative(time, flight, q, v)
+        along = subtract(a, scale(dot(a, face.normal), face.normal))
+        share = jnp.where(rolls, 1.0 / (1.0 + self.scene.ball.inertia_ratio), 1.0)  # what the spin does not take
+        return v, _where(on, scale(share, along), a)
+
+    def advanced(self, time, state, q, v, duration):
+        rolls = (state.support >= 0) & self._rolls(state.support)
+        flight = self.scene.advanced(time, state.flight, q, v, duration)
+        face, _ = self._face(state.support, state.flight.position, time)
+        before, after = (self._rolling_spin(face.normal, u, flight.spin) for u in (state.flight.velocity, v))
+        orientation = flight.orientation
+        if orientation is not None:
+            orientation = jnp.where(
+                rolls, rolled(state.flight.orientation, before, after, duration, orientation.dtype), orientation
+            )
+        spin = _where(rolls, after, flight.spin)
+        return Travel(flight._replace(spin=spin, orientation=orientation), state.support)
+
+    # Contacts
+
+    def phase(self, state):
+        return jnp.asarray(state.support).astype(jnp.int32)
+
+    def named(self, contact, state):
+        return jnp.where(contact >= len(self.scene.surfaces), self.phase(state), contact)
+
+    def _exit(self, contact: int, state: Travel, time: Any) -> tuple[Vector3, Vector3, Number, Any]:
+        """Along one pair of edges: across, middle, half size, and whether there are such edges."""
+        face, edged = self._face(state.support, state.flight.position, time)
+        assert face.half is not None
+        k = contact - len(self.scene.surfaces)
+        return face.tangents[k], face.center, face.half[k], (state.support >= 0) & (edged > 0)
+
+    def level(self, contact, time, q, state):
+        if contact < len(self.scene.surfaces):
+            return jnp.where(state.support == contact, 1.0, self.scene.level(contact, time, q, state.flight))
+        across, middle, half, present = self._exit(contact, state, time)
+        y = dot(across, subtract(q, middle))
+        return jnp.where(present, round_level((y,), half, True), 1.0)
+
+    def reach(self, contact, q):
+        return self.scene.reach(contact, q) if contact < len(self.scene.surfaces) else self.scene.ball.radius
+
+    def bend(self, contact, time, window, state):
+        if contact < len(self.scene.surfaces):
+            bend, skip = self.scene.bend(contact, time, window, state.flight), state.support == contact
+        else:
+            across, middle, half, present = self._exit(contact, state, time)
+            bend, skip = round_bend(window, (across,), middle, half, True), ~present
+        low, high = (jnp.where(skip, 0.0, x) for x in bend)
+        return type(bend)(low, high)
+
+    def is_bounded(self, contact):
+        return contact >= len(self.scene.surfaces) or self.scene.is_bounded(contact)
+
+    def extent(self, contact):
+        return self.scene.extent(contact) if contact < len(self.scene.surfaces) else self.scene.ball.radius
+
+    # What happens there
+
+    def _landing(self, contact: Any, time: Any, flight: Flight) -> tuple[Flight, train.Start]:
+        """The ball after the impact, and what a train begins with."""
+        struck, _ = self.scene.impact(contact, time, flight, KINDS.bounce)
+        face, _ = self._face(contact, flight.position, time)
+        gravity, radius = components(self.scene.gravity), self.scene.ball.radius
+        return struck, train.start(struck.velocity, struck.spin, face.normal, gravity, radius)
+
+    def _laws(self, contact: Any) -> tuple[Number, Number]:
+        """e_n and e_t of the surface of that index, if it is one to settle on."""
+        laws = [self.scene.surfaces[i].law for i in self._floors]
+        reversals: list = [law.reversal() for law in laws]
+        return _pick(contact, self._floors, [law.restitution for law in laws]), _pick(contact, self._floors, reversals)
+
+    def _room(self, contact: Any, x: Vector3, time: Any) -> Number:
+        """How far the centre can go from a place on a surface without meeting another, or the face's edge."""
+        radius = self.scene.ball.radius
+        face, edged = self._face(contact, x, time)
+        assert face.half is not None
+        room: Number = jnp.inf
+        for across, half in zip(face.tangents, face.half, strict=True):
+            margin = half - abs(dot(across, subtract(x, face.center)))
+            room = minimum(room, jnp.where(edged > 0, margin, jnp.inf))
+        for i, surface in enumerate(self.scene.surfaces):
+            room = minimum(room, jnp.where(contact == i, jnp.inf, surface.clearance(x, time, radius)))
+        return room
+
+    def _ends_in_time(self, contact: Any, time: Any, struck: Flight, first: train.Start, left: Any, rests: Any) -> Any:
+        """Whether the train ends before t1, before any other surface or edge can be reached, and unmoved by air."""
+        restitution, _ = self._laws(contact)
+        lasts = train.duration(first, restitution)
+        lasts_known = jnp.where(jnp.isfinite(lasts), lasts, 0.0)
+        height = ratio(first.rise * first.rise, 2.0 * first.pull)
+        clear = train.span(first, lasts_known) + height < self._room(contact, struck.position, time)
+        calm = jnp.asarray(True)
+        if self.scene.air is not None:
+            push = self.scene.air.acceleration(self.scene.ball, struck.velocity, struck.spin)
+            calm = norm(push) * lasts_known <= self.tolerance
+        if struck.orientation is not None:  # infinitely many rotations have no sum
+            calm = jnp.asarray(False)
+        return (lasts <= left) & ((clear & calm) | rests)
+
+    def _stays(self, contact: Any, support: Any) -> Any:
+        """Whether a ball on `support` stays on it when it hits a surface: Theorem 5.1 needs one common mu there, and a
+        smooth wall turns the ball round."""
+        rolls = self._rolls(support)
+        stays = []
+        for surface in self.scene.surfaces:
+            law = surface.law
+            common = law.rolls and law.reversal() == law.restitution
+            stays.append(jnp.where(rolls & jnp.asarray(common), 1.0, 0.0) if law.rolls else float(law.rolls is False))
+        return jnp.asarray(select(contact, stays)) > 0.5
+
+    def follows(self, contact, time, state, left, rests, ends):
+        flight, on = state.flight, state.support >= 0
+        is_exit = contact >= len(self.scene.surfaces)
+        struck, first = self._landing(contact, time, flight)
+        restitution, reversal = self._laws(contact)
+        below = self._face(contact, flight.position, time)[0].below
+        is_floor = jnp.any(jnp.stack([contact == i for i in self._floors])) & below & (first.pull > 0)
+        ends = is_floor & self._ends_in_time(contact, time, struck, first, left, rests)
+        moves = dot(first.slip, first.slip) + dot(first.along, first.along) > 0
+        endless = ends & self._rolls(contact) & (abs(reversal) == 1) & (restitution < 1) & moves
+        lies = is_floor & rests
+
+        bounce_or_end = KINDS.where(ends, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
+        wall = KINDS.where(self._stays(contact, state.support), KINDS.rolling, KINDS.bounce)
+        kind = KINDS.where(on, KINDS.where(is_exit, KINDS.left, wall), bounce_or_end)
+
+        stuck = ~is_exit & jnp.where(on, rests, ends & ~is_floor)
+        fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
+        fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
+        fault = RESULTS.where(on & is_exit & self._tips(contact, time, state), RESULTS.pivoting, fault)
+        return kind, fault
+
+    def _tips(self, contact: Any, time: Any, state: Travel) -> Any:
+        """Whether a ball that comes to an edge is too slow to fly off: v^2 < g_n r, v across the edge."""
+        face, _ = self._face(state.support, state.flight.position, time)
+        second = contact > len(self.scene.surfaces)
+        across = _where(second, face.tangents[1], face.tangents[0])
+        speed = dot(across, state.flight.velocity)
+        pull = times(-1.0, dot(face.normal, components(self.scene.gravity)))
+        return speed * speed < pull * self.scene.ball.radius * (1.0 + 1e-5)
+
+    def impact(self, contact, time, state, kind):
+        flight, on = state.flight, state.support >= 0
+        struck, first = self._landing(contact, time, flight)
+        is_train, rolls, left = (kind == each for each in (KINDS.train, KINDS.rolling, KINDS.left))
+        settles = ~on & (is_train | rolls)
+        first = first._replace(rise=jnp.where(is_train, first.rise, 0.0))
+        restitution, reversal = self._laws(contact)
+        ball = self.scene.ball
+        end = train.summed(first, restitution, reversal, ball.inertia_ratio, ball.radius, self._rolls(contact))
+        kept = self._against(contact, time, flight, state.support)
+
+        velocity = _where(left, flight.velocity, _where(on & rolls, kept.velocity, struck.velocity))
+        spin = _where(left, flight.spin, _where(on & rolls, kept.spin, struck.spin))
+        after = flight._replace(
+            position=_where(settles, add(flight.position, end.shift), flight.position),
+            velocity=_where(settles, end.velocity, velocity),
+            spin=_where(settles, end.spin, spin),
+        )
+        surface = jnp.asarray(contact).astype(jnp.asarray(state.support).dtype)
+        support = jnp.where(settles, surface, jnp.where(on & rolls, state.support, -1.0))
+        return Travel(after, support), jnp.where(settles, end.time, 0.0)
+
+    def _against(self, contact: Any, time: Any, flight: Flight, support: Any) -> Flight:
+        """A ball that stays on its support hits another surface. With c = n x n', d = n - n', the one motion that both
+        contacts allow is v = r c, omega = d: v+ = -mu v + (1 + mu) times its projection on that (4.2), Theorem 5.1. A
+        smooth wall reverses only what is normal to it."""
+        ball, x = self.scene.ball, flight.position
+        face, _ = self._face(support, x, time)
+        n, surfaces = face.normal, self.scene.surfaces
+        wall = select_vector(contact, [surface.direction(x, time) for surface in surfaces])
+        mu = select(contact, [surface.law.restitution for surface in surfaces])
+        smooth = jnp.asarray(select(contact, [float(surface.law.rolls is False) for surface in surfaces])) > 0.5
+        c, d = cross(n, wall), subtract(n, wall)
+        weight = times(ball.inertia_ratio, ball.radius)
+        both = plus(dot(c, flight.velocity), times(weight, dot(d, flight.spin)))
+        share = ratio(times(plus(1.0, mu), both), plus(dot(c, c), times(ball.inertia_ratio, dot(d, d))))
+        velocity = add(scale(times(-1.0, mu), flight.velocity), scale(share, c))
+        spin = add(scale(times(-1.0, mu), flight.spin), scale(ratio(share, ball.radius), d))
+        into = subtract(wall, scale(dot(wall, n), n))
+        back = ratio(times(plus(1.0, mu), dot(into, flight.velocity)), dot(into, into))
+        turned = subtract(flight.velocity, scale(back, into))
+        rolling = _where(self._rolls(support), self._rolling_spin(n, turned, flight.spin), flight.spin)
+        return flight._replace(velocity=_where(smooth, turned, velocity), spin=_where(smooth, rolling, spin))
+
+    def during(self, contact, time, state, elapsed):
+        """The state so long after the first impact of a train."""
+        struck, first = self._landing(contact, time, state.flight)
+        restitution, reversal = self._laws(contact)
+        count = train.bounces_within(first, restitution, elapsed)
+        ball = self.scene.ball
+        numbers = (restitution, reversal, ball.inertia_ratio, ball.radius, self._rolls(contact))
+        last = train.bounced(first, *numbers, count)
+        velocity = add(last.velocity, scale(last.rise, first.normal))
+        since = jnp.maximum(elapsed - last.time, 0.0)
+        gravity = components(self.scene.gravity)
+        fall = add(scale(since, velocity), scale(0.5 * since * since, gravity))
+        position = add(add(struck.position, last.shift), fall)
+        return Travel(struck._replace(position=position, velocity=add(velocity, scale(since, gravity)),
+                                      spin=last.spin), -1.0)  # fmt: skip
+
+    def is_at_rest(self, before, after):
+        eps = float(jnp.finfo(after.flight.position[0].dtype).eps)
+        size: Callable = lambda flight: norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)  # noqa: E731
+        face, _ = self._face(after.support, after.flight.position, 0.0)
+        g = components(self.scene.gravity)
+        along = subtract(g, scale(dot(g, face.normal), face.normal))
+        still = size(after.flight) <= 64.0 * eps * size(before.flight)
+        return (after.support >= 0) & still & (norm(along) <= 64.0 * eps * norm(g)) & (self.scene.air is None)
+
+    # Users' states
+
+    def is_admissible(self, time, state):
+        return self.scene.is_admissible(time, state.flight)
+
+    def received(self, state, batch):
+        return self.scene.received(state, batch)
+
+    def unpacked(self, state, phase=None):
+        flight = self.scene.unpacked(state)
+        dtype = state.position.dtype
+        support = jnp.asarray(-1.0, dtype=dtype) if phase is None else jnp.asarray(phase).astype(dtype)
+        return Travel(flight, support)
+
+    def packed(self, state):
+        return self.scene.packed(state.flight)
+
+    def contact_frame(self, contact, time, state):
+        return self.scene.contact_frame(contact, time, state.flight)
+
+    def without_contacts(self):
+        return dataclasses.replace(self, hits=False)
+
+
+def _pick(index: Any, keys: Sequence[int], options: Sequence[Number]) -> Number:
+    """The option whose key is `index`; the last one for every other index."""
+    result = options[-1]
+    for key, option in zip(keys[-2::-1], options[-2::-1], strict=True):
+        result = where_number(index == key, option, result)
+    return result
+
+
+def grounded(scene: Scene, tolerance: float) -> Scene | Grounded:
+    """A scene with the motion after the last bounce, if there can be a last one."""
+    settles = any(_can_settle(surface) for surface in scene.surfaces)
+    return Grounded(scene, tolerance) if settles else scene
