@@ -39,6 +39,7 @@ class Travel(NamedTuple):
 
     flight: Flight
     support: Any  # index of the surface that the ball stays on, -1 in flight; a float, as all of a state is
+    below: Any = None  # the face that it is on, and whether that has edges; only while an arc is worked on
 
 
 def _can_settle(surface: AbstractSurface) -> bool:
@@ -112,9 +113,12 @@ class Grounded(AbstractSystem):
         """The spin without slip: (1.1) solved for the part along the surface. The part about the normal stays."""
         return add(scale(ratio(1.0, self.scene.ball.radius), cross(normal, velocity)), scale(dot(normal, spin), normal))
 
+    def prepared(self, time, state):
+        return state._replace(below=self._face(state.support, state.flight.position, time))
+
     def derivative(self, time, state, q, v):
         flight, on = state.flight, state.support >= 0
-        face, _ = self._face(state.support, flight.position, time)
+        face, _ = self._below(time, state)
         rolls = on & self._rolls(state.support)
         if self.scene.air is not None:
             spin = self._rolling_spin(face.normal, v, flight.spin)
@@ -127,7 +131,7 @@ class Grounded(AbstractSystem):
     def advanced(self, time, state, q, v, duration):
         rolls = (state.support >= 0) & self._rolls(state.support)
         flight = self.scene.advanced(time, state.flight, q, v, duration)
-        face, _ = self._face(state.support, state.flight.position, time)
+        face, _ = self._below(time, state)
         before, after = (self._rolling_spin(face.normal, u, flight.spin) for u in (state.flight.velocity, v))
         orientation = flight.orientation
         if orientation is not None:
@@ -145,9 +149,12 @@ class Grounded(AbstractSystem):
     def named(self, contact, state):
         return jnp.where(contact >= len(self.scene.surfaces), self.phase(state), contact)
 
+    def _below(self, time: Any, state: Travel) -> tuple[Face, Any]:
+        return self._face(state.support, state.flight.position, time) if state.below is None else state.below
+
     def _exit(self, contact: int, state: Travel, time: Any) -> tuple[Vector3, Vector3, Number, Any]:
         """Along one pair of edges: across, middle, half size, and whether there are such edges."""
-        face, edged = self._face(state.support, state.flight.position, time)
+        face, edged = self._below(time, state)
         assert face.half is not None
         k = contact - len(self.scene.surfaces)
         return face.tangents[k], face.center, face.half[k], (state.support >= 0) & (edged > 0)
@@ -179,10 +186,13 @@ class Grounded(AbstractSystem):
 
     # What happens there
 
-    def _landing(self, contact: Any, time: Any, flight: Flight) -> tuple[Flight, train.Start]:
+    def _floor(self, contact: Any, time: Any, state: Travel) -> tuple[Face, Any]:
+        """The face that the ball is on, or else that of the surface that it hits; and whether it has edges."""
+        return self._face(jnp.where(state.support >= 0, state.support, contact), state.flight.position, time)
+
+    def _landing(self, contact: Any, time: Any, flight: Flight, face: Face) -> tuple[Flight, train.Start]:
         """The ball after the impact, and what a train begins with."""
         struck, _ = self.scene.impact(contact, time, flight, KINDS.bounce)
-        face, _ = self._face(contact, flight.position, time)
         gravity, radius = components(self.scene.gravity), self.scene.ball.radius
         return struck, train.start(struck.velocity, struck.spin, face.normal, gravity, radius)
 
@@ -192,10 +202,9 @@ class Grounded(AbstractSystem):
         reversals: list = [law.reversal() for law in laws]
         return _pick(contact, self._floors, [law.restitution for law in laws]), _pick(contact, self._floors, reversals)
 
-    def _room(self, contact: Any, x: Vector3, time: Any) -> Number:
+    def _room(self, contact: Any, x: Vector3, time: Any, face: Face, edged: Any) -> Number:
         """How far the centre can go from a place on a surface without meeting another, or the face's edge."""
         radius = self.scene.ball.radius
-        face, edged = self._face(contact, x, time)
         assert face.half is not None
         room: Number = jnp.inf
         for across, half in zip(face.tangents, face.half, strict=True):
@@ -205,20 +214,21 @@ class Grounded(AbstractSystem):
             room = minimum(room, jnp.where(contact == i, jnp.inf, surface.clearance(x, time, radius)))
         return room
 
-    def _ends_in_time(self, contact: Any, time: Any, struck: Flight, first: train.Start, left: Any, rests: Any) -> Any:
-        """Whether the train ends before t1, before any other surface or edge can be reached, and unmoved by air."""
+    def _sums(self, contact: Any, time: Any, struck: Flight, first: train.Start, floor: tuple) -> tuple[Any, Any]:
+        """How long the train lasts, and whether it can be summed: no other surface nor an edge can be reached before it
+        ends, and air changes nothing."""
         restitution, _ = self._laws(contact)
         lasts = train.duration(first, restitution)
         lasts_known = jnp.where(jnp.isfinite(lasts), lasts, 0.0)
         height = ratio(first.rise * first.rise, 2.0 * first.pull)
-        clear = train.span(first, lasts_known) + height < self._room(contact, struck.position, time)
+        clear = train.span(first, lasts_known) + height < self._room(contact, struck.position, time, *floor)
         calm = jnp.asarray(True)
         if self.scene.air is not None:
             push = self.scene.air.acceleration(self.scene.ball, struck.velocity, struck.spin)
             calm = norm(push) * lasts_known <= self.tolerance
         if struck.orientation is not None:  # infinitely many rotations have no sum
             calm = jnp.asarray(False)
-        return (lasts <= left) & ((clear & calm) | rests)
+        return lasts, clear & calm
 
     def _stays(self, contact: Any, support: Any) -> Any:
         """Whether a ball on `support` stays on it when it hits a surface: Theorem 5.1 needs one common mu there, and a
@@ -234,11 +244,12 @@ class Grounded(AbstractSystem):
     def follows(self, contact, time, state, left, rests, ends):
         flight, on = state.flight, state.support >= 0
         is_exit = contact >= len(self.scene.surfaces)
-        struck, first = self._landing(contact, time, flight)
+        floor = self._floor(contact, time, state)
+        struck, first = self._landing(contact, time, flight, floor[0])
         restitution, reversal = self._laws(contact)
-        below = self._face(contact, flight.position, time)[0].below
-        is_floor = jnp.any(jnp.stack([contact == i for i in self._floors])) & below & (first.pull > 0)
-        ends = is_floor & self._ends_in_time(contact, time, struck, first, left, rests)
+        is_floor = jnp.any(jnp.stack([contact == i for i in self._floors])) & floor[0].below & (first.pull > 0)
+        lasts, sums = self._sums(contact, time, struck, first, floor)
+        ends = is_floor & (lasts <= left) & (sums | rests)
         moves = dot(first.slip, first.slip) + dot(first.along, first.along) > 0
         endless = ends & self._rolls(contact) & (abs(reversal) == 1) & (restitution < 1) & moves
         lies = is_floor & rests
@@ -250,12 +261,11 @@ class Grounded(AbstractSystem):
         stuck = ~is_exit & jnp.where(on, rests, ends & ~is_floor)
         fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
         fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
-        fault = RESULTS.where(on & is_exit & self._tips(contact, time, state), RESULTS.pivoting, fault)
+        fault = RESULTS.where(on & is_exit & self._tips(contact, state, floor[0]), RESULTS.pivoting, fault)
         return kind, fault
 
-    def _tips(self, contact: Any, time: Any, state: Travel) -> Any:
+    def _tips(self, contact: Any, state: Travel, face: Face) -> Any:
         """Whether a ball that comes to an edge is too slow to fly off: v^2 < g_n r, v across the edge."""
-        face, _ = self._face(state.support, state.flight.position, time)
         second = contact > len(self.scene.surfaces)
         across = _where(second, face.tangents[1], face.tangents[0])
         speed = dot(across, state.flight.velocity)
@@ -264,14 +274,15 @@ class Grounded(AbstractSystem):
 
     def impact(self, contact, time, state, kind):
         flight, on = state.flight, state.support >= 0
-        struck, first = self._landing(contact, time, flight)
+        face, _ = self._floor(contact, time, state)
+        struck, first = self._landing(contact, time, flight, face)
         is_train, rolls, left = (kind == each for each in (KINDS.train, KINDS.rolling, KINDS.left))
         settles = ~on & (is_train | rolls)
         first = first._replace(rise=jnp.where(is_train, first.rise, 0.0))
         restitution, reversal = self._laws(contact)
         ball = self.scene.ball
         end = train.summed(first, restitution, reversal, ball.inertia_ratio, ball.radius, self._rolls(contact))
-        kept = self._against(contact, time, flight, state.support)
+        kept = self._against(contact, time, flight, state.support, face.normal)
 
         velocity = _where(left, flight.velocity, _where(on & rolls, kept.velocity, struck.velocity))
         spin = _where(left, flight.spin, _where(on & rolls, kept.spin, struck.spin))
@@ -284,13 +295,12 @@ class Grounded(AbstractSystem):
         support = jnp.where(settles, surface, jnp.where(on & rolls, state.support, -1.0))
         return Travel(after, support), jnp.where(settles, end.time, 0.0)
 
-    def _against(self, contact: Any, time: Any, flight: Flight, support: Any) -> Flight:
+    def _against(self, contact: Any, time: Any, flight: Flight, support: Any, n: Vector3) -> Flight:
         """A ball that stays on its support hits another surface. With c = n x n', d = n - n', the one motion that both
         contacts allow is v = r c, omega = d: v+ = -mu v + (1 + mu) times its projection on that (4.2), Theorem 5.1. A
         smooth wall reverses only what is normal to it."""
         ball, x = self.scene.ball, flight.position
-        face, _ = self._face(support, x, time)
-        n, surfaces = face.normal, self.scene.surfaces
+        surfaces = self.scene.surfaces
         wall = select_vector(contact, [surface.direction(x, time) for surface in surfaces])
         mu = select(contact, [surface.law.restitution for surface in surfaces])
         smooth = jnp.asarray(select(contact, [float(surface.law.rolls is False) for surface in surfaces])) > 0.5
@@ -308,7 +318,8 @@ class Grounded(AbstractSystem):
 
     def during(self, contact, time, state, elapsed):
         """The state so long after the first impact of a train."""
-        struck, first = self._landing(contact, time, state.flight)
+        face, _ = self._face(contact, state.flight.position, time)
+        struck, first = self._landing(contact, time, state.flight, face)
         restitution, reversal = self._laws(contact)
         count = train.bounces_within(first, restitution, elapsed)
         ball = self.scene.ball
@@ -322,10 +333,10 @@ class Grounded(AbstractSystem):
         return Travel(struck._replace(position=position, velocity=add(velocity, scale(since, gravity)),
                                       spin=last.spin), -1.0)  # fmt: skip
 
-    def is_at_rest(self, before, after):
+    def is_at_rest(self, contact, time, before, after):
         eps = float(jnp.finfo(after.flight.position[0].dtype).eps)
         size: Callable = lambda flight: norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)  # noqa: E731
-        face, _ = self._face(after.support, after.flight.position, 0.0)
+        face, _ = self._floor(contact, time, before)
         g = components(self.scene.gravity)
         along = subtract(g, scale(dot(g, face.normal), face.normal))
         still = size(after.flight) <= 64.0 * eps * size(before.flight)

@@ -164,7 +164,8 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     size = jnp.where(c.done, 1.0, motion.size(c.control, left))  # finished lanes compute harmless numbers
     last = size >= left
     length = jnp.where(last, left, frozen(size))
-    piece = motion.piece(system, c.time, c.state, c.memory, c.jumped, length)
+    begun = system.prepared(c.time, c.state)
+    piece = motion.piece(system, c.time, begun, c.memory, c.jumped, length)
     arc = piece.arc
     kept, control = motion.judge(c.control, size, piece.trial)
     found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
@@ -180,7 +181,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     elapsed = s * arc.unit
     reached = through & last
     time = jnp.where(reached, t1, c.time + elapsed)
-    arrived = _arrays(system.advanced(time, c.state, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
+    arrived = _arrays(system.advanced(time, begun, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
     arrived = _shared(arrived)
 
     since = c.since + elapsed
@@ -200,7 +201,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     stopped, crossed = _shared_flags((stopped, crossed))
     struck = crossed & ~stopped
     until = time + pause
-    settled = struck & system.is_at_rest(arrived, after)
+    settled = struck & system.is_at_rest(found.contact, time, arrived, after)
     labels = jnp.stack([name, _code(kind), system.phase(after)])
     log = Log(
         _write(c.log.values, c.n_impacts, struck & ~c.done, pack_row(Row(time, until, since, arrived, after))),
@@ -293,7 +294,8 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         last = reached & (index == known.n_arcs - 1)
         left = t1 - time
         whole = jnp.where(used, jnp.where(jnp.isinf(size), left, size), 0.0)
-        piece = motion.piece(system, time, state, memory, jumped, whole)
+        begun = system.prepared(time, state)
+        piece = motion.piece(system, time, begun, memory, jumped, whole)
         arc = piece.arc
         crossed = used & (contact >= 0)
         if system.n_contacts > 0:
@@ -302,7 +304,7 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         s = jnp.where(used, s, 0.0)
         elapsed = s * arc.unit
         moved = jnp.where(last, t1, time + elapsed)
-        arrived = _arrays(system.advanced(moved, state, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
+        arrived = _arrays(system.advanced(moved, begun, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
         arrived = _shared(arrived)
         struck = crossed & (n_impacts < known.n_impacts)
         after, until = arrived, moved

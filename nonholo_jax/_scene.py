@@ -105,6 +105,9 @@ class Scene(AbstractSystem):
     def is_uniform(self):
         return self.air is None
 
+    def prepared(self, time, state):
+        return state
+
     def derivative(self, time, state, q, v):
         g = components(self.gravity)
         return v, g if self.air is None else add(g, self.air.acceleration(self.ball, v, state.spin))
@@ -125,7 +128,7 @@ class Scene(AbstractSystem):
     def named(self, contact, state):
         return contact
 
-    def is_at_rest(self, before, after):
+    def is_at_rest(self, contact, time, before, after):
         return jnp.asarray(False)
 
     def phase(self, state):

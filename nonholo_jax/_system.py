@@ -25,6 +25,10 @@ class AbstractSystem(eqx.Module):
         """The configuration that gaps see, and its velocity: two tuples of scalars."""
 
     @abstractmethod
+    def prepared(self, time: Scalar, state: Any) -> Any:
+        """The state at which an arc begins, with what is worth computing only once for all of the arc."""
+
+    @abstractmethod
     def derivative(self, time: Scalar, state: Any, q: tuple, v: tuple) -> tuple[tuple[Number, ...], tuple[Number, ...]]:
         """The rates of q and of v on the arc that begins at `state`."""
 
@@ -57,7 +61,7 @@ class AbstractSystem(eqx.Module):
         """The contact that the log names, and that is touched afterwards: that itself, but for the edges of a face."""
 
     @abstractmethod
-    def is_at_rest(self, before: Any, after: Any) -> Bool[Array, ""]:
+    def is_at_rest(self, contact: Index, time: Scalar, before: Any, after: Any) -> Bool[Array, ""]:
         """Whether nothing moves any more after an impact."""
 
     @abstractmethod

@@ -111,6 +111,7 @@ def _at_one(trajectory: Trajectory, t: Any) -> Any:
     free = system.without_contacts()
     until = jnp.where(inside, t, begin)
     state, motion = free.unpacked(start, phase), trajectory.motion
+    state = free.prepared(begin, state) if motion.is_closed_form else state
     if motion.is_closed_form:
         piece = motion.piece(free, begin, state, None, jnp.asarray(True), until - begin)
         arc, s = piece.arc, piece.arc.length
