@@ -98,6 +98,7 @@ def design(
     t0: Any = 0.0,
     max_impacts: int = 64,
     motion: Any = None,
+    sum_trains: bool = False,
     solver: Any = None,
     tolerance: float | None = None,
     max_steps: int = 64,
@@ -114,7 +115,7 @@ def design(
     - `bounds`: for a name, the pair (lowest, highest); infinite ones are allowed.
     - `n_starts`: how many local searches; they begin at the best of 64 times as many random candidates, and at
         `state` itself. `key`: of the random candidates (default: `jax.random.key(0)`).
-    - `t1`, `t0`, `max_impacts`, `motion`: as in `simulate`.
+    - `t1`, `t0`, `max_impacts`, `motion`, `sum_trains`: as in `simulate`. Without trains the search compiles faster.
     - `solver`: an `optimistix` least-squares solver (default: Levenberg-Marquardt) or minimiser, or an `optax`
         optimiser. `max_steps`: of each local search.
     - `tolerance`: on the miss; by default 1e-6 m in float64, 1e-3 m in float32.
@@ -136,7 +137,9 @@ def design(
     times = (jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
     motion, _ = checked(scene, motion, max_impacts, None)
     timed = isinstance(goal, AbstractGoal) and goal.passes_after is not None and not motion.is_closed_form
-    problem = _Problem(scene, state, goal, *times, names, _wanted(scene, itinerary), max_impacts, motion, timed)
+    problem = _Problem(
+        scene, state, goal, *times, names, _wanted(scene, itinerary), max_impacts, motion, sum_trains, timed
+    )
     first = read(scene, state, names)
     chart = _chart(scene, state, names, first, _limits(scene, state, names, bounds or {}, dtype))
     initial = _starts(problem, chart, first, n_starts, jax.random.key(0) if key is None else key)
@@ -185,13 +188,15 @@ class _Problem(eqx.Module):
     wanted: tuple[int, ...] | None = eqx.field(static=True)
     max_impacts: int = eqx.field(static=True)
     motion: Any
+    sum_trains: bool = eqx.field(static=True)
     timed: bool = eqx.field(static=True)  # the time of passing through the goal is one more coordinate, the last
 
     def trajectory(self, values: Any, t1: Any = None) -> Trajectory:
         scene, state = write(self.scene, self.state, self.names, values)
         most = self.max_impacts if self.wanted is None else len(self.wanted)
         t1 = self.t1 if t1 is None else t1
-        return simulate(scene, state, t1=t1, t0=self.t0, max_impacts=most, motion=self.motion, throw=False)
+        options = {"max_impacts": most, "motion": self.motion, "sum_trains": self.sum_trains, "throw": False}
+        return simulate(scene, state, t1=t1, t0=self.t0, **options)
 
     def residual(self, values: Any) -> tuple[Any, tuple]:
         """The goal's residual, refused where the motion is none that was asked for; and what happened."""

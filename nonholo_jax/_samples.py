@@ -7,7 +7,7 @@ import numpy as np
 
 from ._outline import as_numpy
 from ._scene import Scene
-from ._types import result_name
+from ._types import kind_name, result_name
 
 
 class Samples(NamedTuple):
@@ -25,6 +25,7 @@ class Strikes(NamedTuple):
 
     time: np.ndarray
     surface: np.ndarray
+    kind: list[str]
     position: np.ndarray
     normal: np.ndarray
     spin: np.ndarray  # just after
@@ -48,11 +49,14 @@ def end_of(trajectory: Any, until: float | None) -> float:
 def sample(trajectory: Any, end: float) -> tuple[Samples, Strikes]:
     log = trajectory.impacts
     shown = (np.asarray(log.surface) >= 0) & (as_numpy(log.time) <= end)
-    times = as_numpy(log.time)[shown]
-    bounds = np.array([float(trajectory.t0), *times, end])
-    per_arc = int(np.clip(900 // (len(times) + 1), 24, 100))
-    inner = np.linspace(bounds[:-1], bounds[1:], per_arc)[1:-1].T
-    asked = np.concatenate([[end], inner.ravel()])
+    times, untils = as_numpy(log.time)[shown], np.minimum(as_numpy(log.until)[shown], end)
+    trains = untils > times  # arcs of their own, between those before and after
+    begins = np.array([float(trajectory.t0), *untils, *times[trains]])
+    ends = np.array([*times, end, *untils[trains]])
+    order = np.argsort(begins, kind="stable")
+    per_arc = int(np.clip(900 // len(begins), 24, 100))
+    inner = np.linspace(begins, ends, per_arc)[1:-1].T
+    asked = np.concatenate([[end], times[trains], inner.ravel()])
     padded = np.full(-(-asked.size // 512) * 512, end)  # few sizes, few compilations
     padded[: asked.size] = asked
     state = trajectory.at(jnp.asarray(padded, dtype=trajectory.t1.dtype))
@@ -60,20 +64,23 @@ def sample(trajectory: Any, end: float) -> tuple[Samples, Strikes]:
     for name in ("position", "velocity", "spin"):
         every = (trajectory.initial, log.before, log.after, state)
         first, before, after, values = (as_numpy(getattr(each, name)) for each in every)
-        opens, closes = np.vstack([first, after[shown]]), np.vstack([before[shown], values[:1]])
-        middle = values[1 : asked.size].reshape(len(bounds) - 1, per_arc - 2, 3)
-        columns.append(np.concatenate([opens[:, None], middle, closes[:, None]], axis=1).reshape(-1, 3))
-    clock = np.concatenate([bounds[:-1, None], inner, bounds[1:, None]], axis=1).ravel()
+        last = 1 + np.count_nonzero(trains)
+        opens = np.vstack([first, after[shown], values[1:last]])
+        closes = np.vstack([before[shown], values[:1], after[shown][trains]])
+        middle = values[last : asked.size].reshape(len(begins), per_arc - 2, 3)
+        columns.append(np.concatenate([opens[:, None], middle, closes[:, None]], axis=1)[order].reshape(-1, 3))
+    clock = np.concatenate([begins[:, None], inner, ends[:, None]], axis=1)[order].ravel()
     position, velocity, spin = columns
-    samples = Samples(clock, position, velocity, spin, np.repeat(np.arange(len(bounds) - 1), per_arc))
+    samples = Samples(clock, position, velocity, spin, np.repeat(np.arange(len(begins)), per_arc))
     good = np.all([np.isfinite(column).all(axis=1) for column in columns], axis=0)
     if not good.any():
         raise ValueError(
             "Argument `trajectory` must have a finite state to draw, but it ended as "
             f"{result_name(trajectory.result)}; try simulate() with throw=True, which says why."
         )
-    rows = (as_numpy(x)[shown] for x in (log.after.position, log.normal, log.after.spin))
-    return Samples(*(column[good] for column in samples)), Strikes(times, np.asarray(log.surface)[shown], *rows)
+    rows = (as_numpy(x)[shown] for x in (log.before.position, log.normal, log.after.spin))
+    kinds = [kind_name(log.kind, int(i)) for i in np.flatnonzero(shown)]
+    return Samples(*(column[good] for column in samples)), Strikes(times, np.asarray(log.surface)[shown], kinds, *rows)
 
 
 def energies(scene: Scene, samples: Samples) -> dict[str, np.ndarray]:

@@ -151,6 +151,7 @@ class SimulateTable(_Table):
     t1: Finite
     t0: Finite = 0.0
     max_impacts: Annotated[int, Field(ge=0, le=1_000_000)] = 64
+    sum_trains: bool = True
     motion: Literal["exact", "integrated"] | None = None
     solver: str | None = None
     rtol: Positive | None = None
@@ -243,6 +244,7 @@ _EXAMPLES = {
     "t0": "t0 = 0.0 (seconds)",
     "t1": "t1 = 2.0 (seconds)",
     "max_impacts": "max_impacts = 16",
+    "sum_trains": "sum_trains = true (false gives every bounce)",
     "motion": 'motion = "integrated"',
     "solver": 'solver = "Tsit5"',
     "rtol": "rtol = 1e-8",

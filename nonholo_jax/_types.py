@@ -69,6 +69,11 @@ def result_name(result: RESULTS) -> str:
     return NAMES_OF_RESULTS[int(result._value)]  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def kind_name(kind: "KINDS", row: int) -> str:
+    """The name of one row of concrete kinds, such as `"bounce"`."""
+    return tuple(KINDS._name_to_item)[int(kind._value[row])]  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def result_message(result: RESULTS) -> str:
     """The sentence that says what one concrete result means and what to try."""
     return RESULTS._index_to_message[int(result._value)]  # pyright: ignore[reportAttributeAccessIssue]

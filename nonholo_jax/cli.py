@@ -234,6 +234,8 @@ def _motion(scene: Any, trajectory: Any) -> dict[str, Any]:
     import jax
     import numpy as np
 
+    from ._types import kind_name
+
     log = jax.tree.map(np.asarray, trajectory.impacts)
     impacts = []
     for i in range(min(int(trajectory.n_impacts), len(log.time))):
@@ -242,6 +244,9 @@ def _motion(scene: Any, trajectory: Any) -> dict[str, Any]:
             {
                 "time": float(log.time[i]),
                 "surface": scene.names[int(log.surface[i])],
+                "kind": kind_name(log.kind, i),
+                "until": float(log.until[i]),
+                "support": scene.names[int(log.support[i])] if log.support[i] >= 0 else None,
                 "point": [float(x) for x in log.point[i]],
                 "normal": [float(x) for x in log.normal[i]],
                 "before": _state(before),
@@ -250,7 +255,7 @@ def _motion(scene: Any, trajectory: Any) -> dict[str, Any]:
         )
     final, initial = _state(trajectory.final), _state(trajectory.initial)
     return {
-        "itinerary": [impact["surface"] for impact in impacts],
+        "itinerary": [impact["surface"] for impact in impacts if impact["kind"] != "left"],
         "impacts": impacts,
         "final": final,
         "time": float(trajectory.t1),
@@ -265,7 +270,7 @@ def _design(file: Any) -> _Answer:
     from ._goal import ReturnTo
     from ._types import result_name
 
-    answer = design(file.scene, file.throw, **file.design.arguments, **file.simulate.arguments)
+    answer = design(file.scene, file.throw, **(file.simulate.arguments | file.design.arguments))
     jax.block_until_ready(answer.miss)
     values = [float(x) for x in answer.values]
     reached = int((answer.starts.met & (answer.starts.miss <= answer.tolerance)).sum())
@@ -302,6 +307,8 @@ def _design(file: Any) -> _Answer:
 
 # Printing
 
+_LABELS = {"bounce": "{}", "train": "{}, dies out", "rolling": "{}, rolling", "left": "over the edge of {}"}
+
 
 def _unit(name: str) -> str:
     """The SI unit of a number by its name in the grammar of scene files."""
@@ -316,13 +323,14 @@ def _triple(vector: list[float]) -> str:
 def _table(report: dict[str, Any]) -> list[str]:
     """The throw, every impact and the end, one aligned line each."""
     impacts = report["impacts"]
-    width = max([len("surface"), *(len(impact["surface"]) for impact in impacts)])
+    labels = [_LABELS[impact["kind"]].format(impact["surface"]) for impact in impacts]
+    width = max([len("surface"), *map(len, labels)])
     lines = [
         f"  {'time':>8}  {'':{width}}  {'position':^29}  {'velocity after':^29}  {'spin after':^29}",
         f"  {'s':>8}  {'surface':{width}}  {'m':^29}  {'m/s':^29}  {'rad/s':^29}",
     ]
     rows = [(None, "(throw)", report["throw"])]
-    rows += [(impact["time"], impact["surface"], impact["after"]) for impact in impacts]
+    rows += [(impact["until"], label, impact["after"]) for impact, label in zip(impacts, labels, strict=True)]
     rows.append((report["time"], "(end)", report["final"]))
     for moment, label, state in rows:
         clock = "" if moment is None else f"{moment:.5f}"

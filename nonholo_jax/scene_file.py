@@ -43,6 +43,7 @@ class SimulateTask(NamedTuple):
     t0: float = 0.0
     max_impacts: int = 64
     motion: AbstractMotion | None = None
+    sum_trains: bool = True
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -51,7 +52,7 @@ class SimulateTask(NamedTuple):
 
 class DesignTask(NamedTuple):
     """The `[design]` table; `[simulate]` says how the motion is computed:
-    `design(file.scene, file.throw, **file.design.arguments, **file.simulate.arguments)`."""
+    `design(file.scene, file.throw, **file.simulate.arguments | file.design.arguments)`."""
 
     free: tuple[str, ...]
     goal: Any
@@ -59,6 +60,7 @@ class DesignTask(NamedTuple):
     bounds: dict[str, tuple[float, float]] | None = None
     n_starts: int = 16
     seed: int = 0
+    sum_trains: bool = False
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -234,7 +236,7 @@ def _simulate(document: Document, scene: Scene) -> SimulateTask | None:
         except ValueError:  # the one thing left that can be wrong
             what = f"`simulate.dt0` must be given for the constant steps of {table.solver!r}, but got nothing"
             raise SceneError(f"{what}; add dt0 = 1e-3 (seconds)") from None
-    return SimulateTask(table.t1, table.t0, table.max_impacts, motion)
+    return SimulateTask(table.t1, table.t0, table.max_impacts, motion, table.sum_trains)
 
 
 def _solver(name: str) -> Any:
@@ -338,7 +340,9 @@ def _tables(file: SceneFile) -> dict[str, Any]:
     }
     tables["throw"] = _given(file.throw, ("position", "velocity", "spin", "orientation"))
     if file.simulate is not None:
-        tables["simulate"] = _given(file.simulate, ("t0", "t1", "max_impacts")) | _motion_fields(file.simulate.motion)
+        tables["simulate"] = _given(file.simulate, ("t0", "t1", "max_impacts", "sum_trains")) | _motion_fields(
+            file.simulate.motion
+        )
     if file.design is not None:
         task = file.design
         tables["design"] = _given(task, ("free", "itinerary", "n_starts", "seed"))
