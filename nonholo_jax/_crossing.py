@@ -79,9 +79,18 @@ def _here(arc: Arc, s: Any) -> _Here:
     return _Here(s, coefficients, tuple(evaluate(tuple(abs(c) for c in p), s) for p in arc.configuration))
 
 
-def _is_exact(system: AbstractSystem, contact: int, here: _Here) -> bool:
+def _is_exact(system: AbstractSystem, contact: int, path: tuple[Polynomial, ...]) -> bool:
     """Whether the level along the path is a parabola, so that one step ends at its zero."""
-    return system.reach(contact, here.position) is None and all(len(p) <= 3 for p in here.coefficients)
+    return system.reach(contact, tuple(p[0] for p in path)) is None and all(len(p) <= 3 for p in path)
+
+
+def _returns(system: AbstractSystem, contact: int, arc: Arc) -> Bool[Array, ""]:
+    """Whether an arc begins on a plane: then the search has found the time of return from the velocity alone, and the
+    level there, which is nothing but rounding, could only spoil it by rounding over the speed."""
+    if not _is_exact(system, contact, arc.configuration):
+        return jnp.asarray(False)
+    q = frozen(tuple(p[0] for p in arc.configuration))
+    return abs(frozen(system.level(contact, arc.time, q, arc.start))) <= rounding(system, contact, q)
 
 
 def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, window: Any, touching: Any) -> _Step:
@@ -90,7 +99,7 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, wind
     value, rate = slope(lambda x: system.level(contact, arc.time, x, arc.start), here.position, here.tangent)
     tolerance = rounding(system, contact, size)
     reach = system.reach(contact, here.position)
-    exact = _is_exact(system, contact, here)
+    exact = _is_exact(system, contact, coefficients)
     width = left
     if reach is not None:
         bends = [times(2.0, p[2]) if len(p) > 2 else 0.0 for p in coefficients]
@@ -175,13 +184,15 @@ def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meet
     for i in range(system.n_contacts):
         value, rate = slope(lambda x, i=i: system.level(i, arc.time, x, arc.start), here.position, here.tangent)
         bend = system.bend(i, arc.time, Window(here.coefficients, 0.0), arc.start)
-        flat = 1.0 if _is_exact(system, i, here) else 0.0
-        columns.append((value, rate, bend.low, rounding(system, i, here.size), flat))
-    value, rate, bend, tolerance, flat = [select(contact, column) for column in zip(*columns, strict=True)]
+        flat = 1.0 if _is_exact(system, i, here.coefficients) else 0.0
+        returns = jnp.where(_returns(system, i, arc), 1.0, 0.0)
+        columns.append((value, rate, bend.low, rounding(system, i, here.size), flat, returns))
+    value, rate, bend, tolerance, flat, returns = [select(contact, column) for column in zip(*columns, strict=True)]
     value, rate, bend, tolerance = shared([value, rate, bend, tolerance])
     rests = (bend < 0) & (rate * rate <= -2.0 * bend * tolerance)
     # On a plane a bounce of any height is computed, down to the rounding of the velocity itself.
     noise = 16.0 * float(jnp.finfo(s.dtype).eps) * norm(here.tangent)
+    value = jnp.where(returns > 0.5, 0.0, value)
     return Meeting(value, rate, rests, rests & (jnp.asarray(flat < 0.5) | (jnp.abs(rate) <= noise)))  # pyright: ignore
 
 
@@ -195,11 +206,12 @@ def newton(arc: Arc, s: Scalar, value: Number, rate: Number) -> Scalar:
 def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Scalar:
     """The local time of a crossing found near `s`, differentiable in the arc and the system: two Newton steps, so
     that second derivatives are right too."""
-    s = frozen(s)
+    known = s = frozen(s)
+    returns = select(contact, [jnp.where(_returns(system, i, arc), 1.0, 0.0) for i in range(system.n_contacts)])
     for _ in range(2):
         q, tangent = arc.position(s), arc.tangent(s)
         pairs = [
             slope(lambda x, i=i: system.level(i, arc.time, x, arc.start), q, tangent) for i in range(system.n_contacts)
         ]
         (s,) = shared([newton(arc, s, *(select(contact, column) for column in zip(*pairs, strict=True)))])
-    return s
+    return jnp.where(returns > 0.5, known + (s - frozen(s)), s)  # pyright: ignore[reportOperatorIssue]

@@ -98,7 +98,7 @@ def design(
     t0: Any = 0.0,
     max_impacts: int = 64,
     motion: Any = None,
-    sum_trains: bool = False,
+    sum_trains: bool | None = None,
     solver: Any = None,
     tolerance: float | None = None,
     max_steps: int = 64,
@@ -115,7 +115,7 @@ def design(
     - `bounds`: for a name, the pair (lowest, highest); infinite ones are allowed.
     - `n_starts`: how many local searches; they begin at the best of 64 times as many random candidates, and at
         `state` itself. `key`: of the random candidates (default: `jax.random.key(0)`).
-    - `t1`, `t0`, `max_impacts`, `motion`, `sum_trains`: as in `simulate`. Without trains the search compiles faster.
+    - `t1`, `t0`, `max_impacts`, `motion`, `sum_trains` (default: only without an itinerary): as in `simulate`.
     - `solver`: an `optimistix` least-squares solver (default: Levenberg-Marquardt) or minimiser, or an `optax`
         optimiser. `max_steps`: of each local search.
     - `tolerance`: on the miss; by default 1e-6 m in float64, 1e-3 m in float32.
@@ -137,9 +137,8 @@ def design(
     times = (jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
     motion, _ = checked(scene, motion, max_impacts, None)
     timed = isinstance(goal, AbstractGoal) and goal.passes_after is not None and not motion.is_closed_form
-    problem = _Problem(
-        scene, state, goal, *times, names, _wanted(scene, itinerary), max_impacts, motion, sum_trains, timed
-    )
+    how = (max_impacts, motion, itinerary is None if sum_trains is None else sum_trains, timed)
+    problem = _Problem(scene, state, goal, *times, names, _wanted(scene, itinerary), *how)
     first = read(scene, state, names)
     chart = _chart(scene, state, names, first, _limits(scene, state, names, bounds or {}, dtype))
     initial = _starts(problem, chart, first, n_starts, jax.random.key(0) if key is None else key)

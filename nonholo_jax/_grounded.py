@@ -188,7 +188,7 @@ class Grounded(AbstractSystem):
 
     def _floor(self, contact: Any, time: Any, state: Travel) -> tuple[Face, Any]:
         """The face that the ball is on, or else that of the surface that it hits; and whether it has edges."""
-        return self._face(jnp.where(state.support >= 0, state.support, contact), state.flight.position, time)
+        return self._face(jnp.where(state.support >= 0, self.phase(state), contact), state.flight.position, time)
 
     def _landing(self, contact: Any, time: Any, flight: Flight, face: Face) -> tuple[Flight, train.Start]:
         """The ball after the impact, and what a train begins with."""

@@ -119,6 +119,11 @@ def _write(buffer: Any, index: Any, wanted: Any, value: Any) -> Any:
     return buffer.at[jnp.where(wanted, index, rows)].set(value, mode="drop")
 
 
+def _written(record: Any, index: Any, wanted: Any, *values: Any) -> Any:
+    """A log or a path with one more row."""
+    return type(record)(*[_write(buffer, index, wanted, x) for buffer, x in zip(record, values, strict=True)])
+
+
 def _shared(state: Any) -> Any:
     leaves, treedef = jax.tree.flatten(state)
     return jax.tree.unflatten(treedef, shared(leaves))
@@ -202,15 +207,10 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     struck = crossed & ~stopped
     until = time + pause
     settled = struck & system.is_at_rest(found.contact, time, arrived, after)
-    labels = jnp.stack([name, _code(kind), system.phase(after)])
-    log = Log(
-        _write(c.log.values, c.n_impacts, struck & ~c.done, pack_row(Row(time, until, since, arrived, after))),
-        _write(c.log.labels, c.n_impacts, struck & ~c.done, labels),
-    )
-    path = Path(
-        _write(c.path.sizes, c.n_arcs, ended & ~c.done, frozen(jnp.stack([jnp.where(last, jnp.inf, length), s]))),
-        _write(c.path.labels, c.n_arcs, ended & ~c.done, jnp.stack([found.contact, labels[1]])),
-    )
+    row, labels = Row(time, until, since, arrived, after), jnp.stack([name, _code(kind), system.phase(after)])
+    log = _written(c.log, c.n_impacts, struck & ~c.done, pack_row(row), labels)
+    sizes = frozen(jnp.stack([jnp.where(last, jnp.inf, length), s]))
+    path = _written(c.path, c.n_arcs, ended & ~c.done, sizes, jnp.stack([found.contact, labels[1]]))
 
     result = RESULTS.where(crossed & full, RESULTS.max_impacts, c.result)
     result = RESULTS.where(crossed & stuck, RESULTS.corner, result)

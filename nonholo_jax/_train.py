@@ -56,7 +56,7 @@ def span(first: Start, time: Number) -> Number:
 
 
 def summed(
-    first: Start, restitution: Number, reversal: Number, inertia_ratio: Number, radius: Number, rolls: bool | Number
+    first: Start, restitution: Number, reversal: Number, inertia_ratio: Number, radius: Number, rolls: Any
 ) -> End:
     """After all of the bounces. Then the ball rolls, or, on a smooth surface, slides."""
     none = scale(0.0, first.slip)
@@ -69,7 +69,7 @@ def bounced(
     reversal: Number,
     inertia_ratio: Number,
     radius: Number,
-    rolls: bool | Number,
+    rolls: Any,
     count: Number,
 ) -> End:
     """After `count` more bounces."""

@@ -99,7 +99,7 @@ def _at_one(trajectory: Trajectory, t: Any) -> Any:
     start, begin, phase = trajectory.initial, trajectory.t0, jnp.asarray(-1, dtype=jnp.int32)
     if rows > 0:
         n = jnp.minimum(trajectory.n_impacts, rows)
-        past = jnp.sum((log.until <= t) & (jnp.arange(rows, dtype=n.dtype) < n))
+        past = jnp.sum((log.until <= t) & (jnp.arange(rows, dtype=n.dtype) < n), dtype=n.dtype)
         row = jnp.maximum(past - 1, 0)
         start = jax.tree.map(lambda a, b: jnp.where(past > 0, a[row], b), log.after, start)
         begin = jnp.where(past > 0, log.until[row], begin)

@@ -52,7 +52,7 @@ class SimulateTask(NamedTuple):
 
 class DesignTask(NamedTuple):
     """The `[design]` table; `[simulate]` says how the motion is computed:
-    `design(file.scene, file.throw, **file.simulate.arguments | file.design.arguments)`."""
+    `design(file.scene, file.throw, **file.design.arguments, **file.simulate.arguments)`."""
 
     free: tuple[str, ...]
     goal: Any
@@ -60,7 +60,6 @@ class DesignTask(NamedTuple):
     bounds: dict[str, tuple[float, float]] | None = None
     n_starts: int = 16
     seed: int = 0
-    sum_trains: bool = False
 
     @property
     def arguments(self) -> dict[str, Any]:
