@@ -7,6 +7,7 @@ from ._box import Box as Box, Rectangle as Rectangle
 from ._design import Design as Design, design as design
 from ._goal import AbstractGoal as AbstractGoal, HitTarget as HitTarget, Land as Land, ReturnTo as ReturnTo
 from ._impact import collide as collide, projector as projector
+from ._lagrangian import Barrier as Barrier, LagrangianSystem as LagrangianSystem
 from ._law import AbstractContactLaw as AbstractContactLaw, Frictional as Frictional, Rough as Rough, Smooth as Smooth
 from ._motion import AbstractMotion as AbstractMotion, Exact as Exact
 from ._motion_integrated import Integrated as Integrated

@@ -203,3 +203,17 @@ def collide(
         y = y - _dot(w_plus, _dot(rows, offset))
     change = jsp.linalg.solve_triangular(factor, y, trans="T", lower=True) / scale
     return velocity - (1 + jnp.asarray(restitution, velocity.dtype)) * change
+
+
+def accelerate(metric: Array, constraint: Array, force: Array, rate: Array) -> Array:
+    """The a with A a = rate and G a = force + A^T lambda for some lambda: Lagrange-d'Alembert's equations, solved in
+    whitened coordinates by projection. A, shape (m, n), may have any rank; `rate` must be in its range."""
+    if constraint.shape[0] == 0:
+        scale = lax.stop_gradient(jnp.sqrt(jnp.diagonal(metric)))
+        factor = jnp.linalg.cholesky(metric / scale[:, None] / scale[None, :])
+        return jsp.linalg.cho_solve((factor, True), force / scale) / scale
+    scale, factor, w, rows = _whiten(metric, constraint)
+    w_plus, pi = _pseudo_inverse(w)
+    y = jsp.linalg.solve_triangular(factor, force / scale, lower=True)
+    y = y - _dot(pi, y) + _dot(w_plus, _dot(rows, rate))
+    return jsp.linalg.solve_triangular(factor, y, trans="T", lower=True) / scale

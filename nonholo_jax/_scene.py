@@ -177,7 +177,7 @@ class Scene(AbstractSystem):
             holds.append(jnp.asarray(depth >= 0))
         return jnp.all(jnp.stack(holds))
 
-    def received(self, state, batch):
+    def received(self, state, batch, t0):
         check_ball_state(state, batch)
         return state
 

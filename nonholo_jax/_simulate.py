@@ -70,7 +70,7 @@ def simulate(
     """
     motion, log_rows = checked(scene, motion, max_impacts, log_size)
     system = _continued(scene, motion, sum_trains)
-    state = scene.received(state, batch=False)
+    state = scene.received(state, batch=False, t0=t0)
     dtype = jax.tree.leaves(state)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)
@@ -115,7 +115,7 @@ def simulate_batch(
     """
     motion, log_rows = checked(scene, motion, max_impacts, log_size)
     system = _continued(scene, motion, sum_trains)
-    states = scene.received(states, batch=True)
+    states = scene.received(states, batch=True, t0=t0)
     dtype = jax.tree.leaves(states)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)

@@ -7,24 +7,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ._gap import bend_of, gradient_of, reach_of, value_of
 from ._law import AbstractContactLaw
-from ._polynomial import Interval, Window, evaluate, product
+from ._polynomial import Interval, Window
 from ._types import Number, Scalar, Vector, Vector3
 from ._vector import (
     as_number,
     as_vector,
     components,
     dot,
-    is_constant,
-    maximum,
-    minimum,
     norm,
     pack,
     plus,
-    ratio,
-    slope,
     times,
-    total,
     unit,
 )
 
@@ -168,9 +163,6 @@ class Plane(AbstractSurface):
         return [nonzero("normal", self.facing)]
 
 
-_SAMPLES = (0.0, 0.25, 0.5, 0.75, 1.0)
-
-
 class Implicit(AbstractSurface):
     """Any surface, given as the zeros of a smooth function of the ball's centre.
 
@@ -202,57 +194,27 @@ class Implicit(AbstractSurface):
         self.curvature = as_number(curvature)
         check(self)
 
-    def _value(self, x, t):
-        dtype = jnp.result_type(*[c for c in x if not is_constant(c)] or [float])
-        return self.function(jnp.stack([jnp.asarray(c, dtype=dtype) for c in x]), t)
-
-    def _gradient(self, x, t):
-        point = jnp.stack([jnp.asarray(c) for c in x])
-        return components(jax.grad(lambda p: self.function(p, t))(point))
-
     def distance(self, x, t):
-        return self._value(x, t)
+        return value_of(lambda p: self.function(p, t), x)
 
     def gap(self, x: Vector, t: float | Scalar = 0.0, radius: float | Scalar = 0.0) -> Scalar:
         """The given function at the ball's centre `x`; the radius is already in it."""
         return self.function(x, t)
 
     def direction(self, x, t):
-        return unit(self._gradient(x, t))
+        return unit(gradient_of(lambda p: self.function(p, t), x))
 
     def clearance(self, x, t, radius):
         return 0.0  # a gap with any slope tells no distance
 
     def level(self, x, t, radius):
-        return self._value(x, t)
+        return value_of(lambda p: self.function(p, t), x)
 
     def reach(self, x, radius):
-        return None if self.curvature is None else ratio(1.0, self.curvature, otherwise=1e12)
+        return reach_of(self.curvature)
 
     def bend(self, window, t, radius):
-        if self.curvature is None:
-            return self._sampled_bend(window, t)
-        start = tuple(p[0] for p in window.coefficients)
-        tracks = [window.track(p) for p in window.coefficients]
-        fastest = norm([maximum(abs(track.rate.low), abs(track.rate.high)) for track in tracks])
-        hardest = norm([maximum(abs(track.bend.low), abs(track.bend.high)) for track in tracks])
-        along = [product(Interval(g, g), track.bend) for g, track in zip(self._gradient(start, t), tracks, strict=True)]
-        # v . H v, and what the gradient can turn by within the window, times the acceleration.
-        turned = times(times(self.curvature, times(fastest, window.width)), hardest)
-        margin = plus(times(self.curvature, fastest * fastest), turned)
-        return Interval(total([x.low for x in along]) - margin, total([x.high for x in along]) + margin)
-
-    def _sampled_bend(self, window, t):
-        def along(s):
-            return self._value(tuple(evaluate(p, s) for p in window.coefficients), t)
-
-        rate = lambda s: slope(lambda z: along(z[0]), (s,), (1.0,))[1]  # noqa: E731
-        like = jnp.asarray(window.width)
-        samples = [slope(lambda z: rate(z[0]), (c * like,), (1.0,))[1] for c in _SAMPLES]
-        low, high = samples[0], samples[0]
-        for sample in samples[1:]:
-            low, high = minimum(low, sample), maximum(high, sample)
-        return Interval(low - (high - low), high + (high - low))
+        return bend_of(lambda p: self.function(p, t), self.curvature, window)
 
     def extent(self):
         return 0.0

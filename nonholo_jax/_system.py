@@ -94,8 +94,8 @@ class AbstractSystem(eqx.Module):
         """Whether the motion can start there."""
 
     @abstractmethod
-    def received(self, state: Any, batch: bool) -> Any:
-        """A user's state (or a batch of them) as arrays. Raises `ValueError` for what cannot be right."""
+    def received(self, state: Any, batch: bool, t0: Any) -> Any:
+        """A user's state (or a batch of them) at t0 as arrays. Raises `ValueError` for what cannot be right."""
 
     @abstractmethod
     def unpacked(self, state: Any, phase: Index | None = None) -> Any:

@@ -49,6 +49,11 @@ class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
         "The ball stays in contact with a surface (it rests, rolls, or its bounces have died out below rounding). "
         "Try an earlier `t1`, or `throw=False` and `Trajectory.t1` for the time reached."
     )
+    barrier_conflict = (
+        "At an impact the barrier and the system ask for velocities that contradict each other, or the barrier does "
+        "not stop the motion towards it. Try a `constraint` of the Barrier that holds the rows of the system's and "
+        "of the gap's gradient, with the `offset` that goes with them."
+    )
 
 
 NAMES_OF_RESULTS = tuple(RESULTS._name_to_item)

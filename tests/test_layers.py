@@ -20,7 +20,10 @@ ORDER = [
     # ground: the mathematics of impact
     "_impact",
     "_law",
+    "_gap",
     "_system",
+    "_checks",
+    "_lagrangian",
     # world
     "_ball",
     "_surface",
