@@ -1,7 +1,7 @@
 """Any Lagrangian system with nonholonomic constraints, in any velocities, that meets barriers."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -131,6 +131,7 @@ class LagrangianSystem(AbstractSystem):
     frame: Any
     forces: Any
     retraction: Any
+    is_long: ClassVar[bool] = True
 
     def __init__(
         self,

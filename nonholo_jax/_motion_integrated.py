@@ -124,7 +124,7 @@ class Integrated(AbstractMotion):
 
     def piece(self, system, time, state, memory, jumped, size):
         if isinstance(self.solver, diffrax.AbstractERK):
-            return _unrolled_step(self.solver, system, time, state, size)
+            return _runge_kutta_step(self.solver, system, time, state, size)
         z0 = _arrays(system.evolving(state), time)
         z1, error, info, memory, _ = self.solver.step(_term(system, state), time, time + size, z0, None, memory, jumped)
         path = self.solver.interpolation_cls(t0=time, t1=time + size, **info)
@@ -164,11 +164,12 @@ def _combination(weights: Any, terms: Sequence) -> Any:
     return total([times(float(w), term) for w, term in zip(weights, terms, strict=False)])
 
 
-def _unrolled_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -> Piece:
-    """One step of an explicit Runge-Kutta method, stage by stage over scalars, and its interpolant."""
-    tableau, (q, v) = solver.tableau, system.evolving(state)
+def _unrolled_stages(tableau: Any, system: Any, time: Any, state: Any, h: Any) -> tuple[list, list]:
+    """The stages of an explicit Runge-Kutta method over scalars: h times the derivative of (q, v), flat; the part of q
+    itself."""
+    q, v = system.evolving(state)
     n = len(q)
-    stages, rates = [], []  # h times the derivative of (q, v), flat; the part of q itself
+    stages, rates = [], []
     for i in range(tableau.num_stages):
         row = tableau.a_lower[i - 1] if i > 0 else ()
         z = [plus(x, _combination(row, [k[j] for k in stages])) for j, x in enumerate((*q, *v))]
@@ -176,7 +177,35 @@ def _unrolled_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -> P
         dq, dv = system.derivative(time + c * h, state, tuple(z[:n]), tuple(z[n:]))
         stages.append(shared([h * x for x in (*dq, *dv)]))
         rates.append(dq)
-    z0 = (*q, *v)
+    return stages, rates
+
+
+def _stages_in_turn(tableau: Any, system: Any, time: Any, state: Any, h: Any) -> tuple[list, list]:
+    """The same by a loop, which holds the system's derivative once: a long one compiles several times as fast."""
+    (q, v), count = system.evolving(state), tableau.num_stages
+    n, z0 = len(q), jnp.stack([jnp.asarray(x, dtype=time.dtype) for x in (*q, *v)])
+    weights, nodes = np.zeros((count, count)), np.zeros(count)
+    for i in range(1, count):
+        weights[i, :i], nodes[i] = tableau.a_lower[i - 1], tableau.c[i - 1]
+
+    def stage(slopes, each):
+        index, row, c = each
+        z = z0 + h * jnp.sum(row[:, None] * slopes, axis=0)
+        dq, dv = system.derivative(time + c * h, state, tuple(z[:n]), tuple(z[n:]))
+        slope = jnp.stack([jnp.asarray(x, dtype=time.dtype) for x in (*dq, *dv)])
+        return slopes.at[index].set(slope), None
+
+    plan = (jnp.arange(count), jnp.asarray(weights, dtype=time.dtype), jnp.asarray(nodes, dtype=time.dtype))
+    slopes, _ = jax.lax.scan(stage, jnp.zeros((count, z0.size), time.dtype), plan)
+    return [tuple(h * k) for k in slopes], [tuple(k[:n]) for k in slopes]
+
+
+def _runge_kutta_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -> Piece:
+    """One step of an explicit Runge-Kutta method and its interpolant."""
+    tableau, (q, v) = solver.tableau, system.evolving(state)
+    n, z0 = len(q), (*q, *v)
+    make = _stages_in_turn if system.is_long else _unrolled_stages
+    stages, rates = make(tableau, system, time, state, h)
     columns = [[k[j] for k in stages] for j in range(len(z0))]
     steps = shared([_combination(tableau.b_sol, column) for column in columns])
     z1 = tuple(plus(x, step) for x, step in zip(z0, steps, strict=True))

@@ -1,7 +1,7 @@
 """A scene: one ball, named surfaces, gravity and perhaps air."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -65,6 +65,7 @@ class Scene(AbstractSystem):
     gravity: Any = eqx.field(converter=as_vector)
     air: Air | None
     names: tuple[str, ...] = eqx.field(static=True)
+    is_long: ClassVar[bool] = False
 
     def __init__(
         self,

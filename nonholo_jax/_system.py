@@ -19,6 +19,7 @@ class AbstractSystem(eqx.Module):
     function with the zeros of the gap, and its derivative there, that is cheaper to bound than the gap itself."""
 
     n_contacts: eqx.AbstractVar[int]
+    is_long: eqx.AbstractClassVar[bool]  # `derivative` is a long program: a loop should hold it only once
 
     @abstractmethod
     def evolving(self, state: Any) -> tuple[tuple[Number, ...], tuple[Number, ...]]:
