@@ -74,22 +74,18 @@ def fit(system: Any, index: int, t: Array, q: Array, n: int) -> dict:
     barrier, metric = system.barriers[index], system.metric_at(q)
     eps = float(jnp.finfo(q.dtype).eps)
     rows = barrier.constraint(q)
-    _, _, w, scaling = _whiten(metric, rows)
+    _, _, w, scaling = _whiten(metric, rows, thorough=False)
     w_plus, pi = _pseudo_inverse(w)
     c = _dot(scaling, barrier.moves(q, t, rows.shape[0]))
     drift = _dot(w_plus, c)  # the least velocity with B v = c
     a, b = system.constraint_at(q, t, n)
-    inside, disagreement = jnp.zeros((), q.dtype), _largest(_dot(w, drift) - c)
-    size = _largest(c) + jnp.sqrt(jnp.sum(drift**2))
-    if a.shape[0] > 0:
-        _, _, a, own = _whiten(metric, a)
-        b = _dot(own, b)
-        inside = _largest(a - _dot(a, pi))
-        disagreement, size = jnp.maximum(disagreement, _largest(_dot(a, drift) - b)), size + _largest(b)
     gradient = jax.grad(barrier.gap)(q)
     gradient = gradient if system.frame is None else _dot(gradient, system.frame(q))
-    _, _, normal, _ = _whiten(metric, gradient[None, :])
-    past = _largest(normal - _dot(normal, pi))
+    _, _, others, scaling = _whiten(metric, jnp.concatenate([a, gradient[None, :]]), thorough=False)
+    outside, b = others - _dot(others, pi), _dot(scaling, jnp.append(b, 0.0))[:-1]
+    inside, past = _largest(outside[:-1]), _largest(outside[-1])
+    disagreement = jnp.maximum(_largest(_dot(w, drift) - c), _largest(_dot(others[:-1], drift) - b))
+    size = _largest(c) + _largest(b) + jnp.sqrt(jnp.sum(drift**2))
     return {
         "inside": (inside <= eps**0.5, inside),
         "agreed": (disagreement <= eps**0.5 * size, disagreement),

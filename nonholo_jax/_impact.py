@@ -76,14 +76,17 @@ def _unit_rows(w: Array) -> tuple[Array, Array]:
     return w / largest / norm, 1 / largest / norm
 
 
-def _whiten(metric: Array, constraint: Array) -> tuple[Array, Array, Array, Array]:
-    """(scale, factor, w, rows): G = L L^T, L = diag(scale) factor; w = rows B L^-T has unit rows."""
+def _whiten(metric: Array, constraint: Array, thorough: bool = True) -> tuple[Array, Array, Array, Array]:
+    """(scale, factor, w, rows): G = L L^T, L = diag(scale) factor; w = rows B L^-T has unit rows. What is not
+    `thorough` is cheaper, and loses digits where rows differ only in components of little inertia."""
     # Nothing that is computed depends on `scale` or on `rows`, so neither needs a derivative.
     scale = lax.stop_gradient(jnp.sqrt(jnp.diagonal(metric)))
     factor = jnp.linalg.cholesky(metric / scale[:, None] / scale[None, :])
     w, first = _unit_rows(constraint / scale[None, :])
-    rows, reduced = _reduce(lax.stop_gradient(w))
-    w = reduced + _dot(rows, w - lax.stop_gradient(w))  # the value of `reduced`, the derivative of rows w
+    rows = jnp.eye(w.shape[0], dtype=w.dtype)
+    if thorough:
+        rows, reduced = _reduce(lax.stop_gradient(w))
+        w = reduced + _dot(rows, w - lax.stop_gradient(w))  # the value of `reduced`, the derivative of rows w
     w, last = _unit_rows(jsp.linalg.solve_triangular(factor, w.T, lower=True).T)
     return scale, factor, w, last * rows * first.T
 
@@ -212,8 +215,16 @@ def accelerate(metric: Array, constraint: Array, force: Array, rate: Array) -> A
         scale = lax.stop_gradient(jnp.sqrt(jnp.diagonal(metric)))
         factor = jnp.linalg.cholesky(metric / scale[:, None] / scale[None, :])
         return jsp.linalg.cho_solve((factor, True), force / scale) / scale
-    scale, factor, w, rows = _whiten(metric, constraint)
+    scale, factor, w, rows = _whiten(metric, constraint, thorough=False)
     w_plus, pi = _pseudo_inverse(w)
     y = jsp.linalg.solve_triangular(factor, force / scale, lower=True)
     y = y - _dot(pi, y) + _dot(w_plus, _dot(rows, rate))
     return jsp.linalg.solve_triangular(factor, y, trans="T", lower=True) / scale
+
+
+def settle(velocity: Array, metric: Array, constraint: Array, offset: Array) -> Array:
+    """The velocity with A v = b nearest to one that nearly is so: only the excess is projected, so that what is right
+    stays as it is."""
+    scale, factor, w, rows = _whiten(metric, constraint, thorough=False)
+    y = _dot(_pseudo_inverse(w)[0], _dot(rows, _dot(constraint, velocity) - offset))
+    return velocity - jsp.linalg.solve_triangular(factor, y, trans="T", lower=True) / scale

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ._checks import conditions, fit, refuse, refuse_shapes
 from ._gap import bend_of, gradient_of, reach_of, value_of
-from ._impact import _dot, accelerate, collide
+from ._impact import _dot, accelerate, collide, settle
 from ._system import AbstractSystem, bounces, rounding
 from ._types import RESULTS, Number
 from ._vector import as_number, components, frozen, is_constant, select
@@ -202,7 +202,7 @@ class LagrangianSystem(AbstractSystem):
 
     def _projected(self, q: Array, v: Array, t: Array) -> Array:
         a, b = self.constraint_at(q, t, v.shape[0])
-        return v if a.shape[0] == 0 else collide(v, self.metric_at(q), a, 0.0, b)
+        return v if a.shape[0] == 0 else settle(v, self.metric_at(q), a, b)
 
     def bending(self, q: Array, v: Array, w: Array, p: Array) -> tuple[Array, Array]:
         """(F^T dL/dq, (F^+ K)^T p): what of dp/dt is not a force. K has the columns [w, F_i]."""
