@@ -67,9 +67,7 @@ class Barrier(eqx.Module):
     offset: Any
     curvature: Number | None
 
-    def __init__(
-        self, gap: Callable, constraint: Callable, restitution: Any = 1.0, offset: Any = None, curvature: Any = None
-    ):
+    def __init__(self, gap: Any, constraint: Any, restitution: Any = 1.0, offset: Any = None, curvature: Any = None):
         self.gap, self.constraint, self.offset = (
             _given("gap", gap), _given("constraint", constraint), _given("offset", offset)
         )  # fmt: skip
@@ -135,16 +133,16 @@ class LagrangianSystem(AbstractSystem):
 
     def __init__(
         self,
-        lagrangian: Callable | None = None,
+        lagrangian: Any = None,
         *,
-        metric: Callable | None = None,
-        potential: Callable | None = None,
-        constraint: Callable | None = None,
-        offset: Callable | None = None,
-        barriers: Sequence[Barrier] = (),
-        frame: Callable | None = None,
-        forces: Callable | None = None,
-        retraction: Callable | None = None,
+        metric: Any = None,
+        potential: Any = None,
+        constraint: Any = None,
+        offset: Any = None,
+        barriers: Any = (),
+        frame: Any = None,
+        forces: Any = None,
+        retraction: Any = None,
     ):
         if (lagrangian is None) == (metric is None) or (metric is None and potential is not None):
             got = [name for name, x in (("lagrangian", lagrangian), ("metric", metric), ("potential", potential)) if x]
@@ -256,9 +254,9 @@ class LagrangianSystem(AbstractSystem):
     def follows(self, contact, time, state, left, rests):
         q, v = state
         fits = [fit(self, i, time, q, v.shape[0]) for i in range(self.n_contacts)]
-        flags = [jnp.all(jnp.stack([holds for holds, _ in each.values()])) for each in fits]
+        fitting = jnp.stack([jnp.all(jnp.stack([holds for holds, _ in each.values()])) for each in fits])
         kind, fault = bounces(rests)
-        return kind, RESULTS.where(select(contact, flags), fault, RESULTS.barrier_conflict)
+        return kind, RESULTS.where(fitting[contact], fault, RESULTS.barrier_conflict)
 
     def impact(self, contact, time, state, kind):
         """(6.1), with the rows of every barrier of the same restitution that is hit at this instant."""

@@ -130,13 +130,13 @@ def _blade_at_wall(q):
 
 def sleigh(restitution: Any = 1.0, mass=1.3, inertia=0.4, ahead=0.3):
     """Chaplygin's. q: (x, y, heading) of the blade, its rates as v; the centre of mass is `ahead` of the blade. A: no
-    velocity across the blade; B of the wall x = 0.5: that, and dx/dt of the blade's point."""
+    velocity across the blade; B of the wall x = 0.1: that, and dx/dt of the blade's point."""
 
     def lagrangian(q, v):
         centre = v[:2] + ahead * v[2] * jnp.stack([-jnp.sin(q[2]), jnp.cos(q[2])])
         return 0.5 * mass * jnp.sum(centre**2) + 0.5 * inertia * v[2] ** 2
 
-    wall = Barrier(lambda q: 0.5 - q[0], _blade_at_wall, restitution, curvature=0.0)
+    wall = Barrier(lambda q: 0.1 - q[0], _blade_at_wall, restitution, curvature=0.0)
     return LagrangianSystem(lagrangian, constraint=_blade, barriers=[wall])
 
 
