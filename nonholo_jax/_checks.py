@@ -120,8 +120,10 @@ def conditions(system: Any, t: Array, q: Array, v: Array) -> dict[Any, tuple[Boo
         fits = fit(system, i, t, q, n)
         found |= {(name, i): fits[name] for name in ("inside", "agreed")}
     a, b = system.constraint_at(q, t, n)
-    excess, size = _dot(a, v) - b, _dot(jnp.abs(a), jnp.abs(v)) + jnp.abs(b)
-    found["velocity"] = (jnp.all(jnp.abs(excess) <= 1e3 * eps * size), _largest(excess))
+    excess = _dot(a, v) - b
+    _, _, _, scaling = _whiten(metric, a, thorough=False)
+    size = jnp.sqrt(jnp.maximum(_dot(v, _dot(metric, v)), 0.0)) + _largest(_dot(scaling, b))
+    found["velocity"] = (_largest(_dot(scaling, excess)) <= 1e3 * eps * size, _largest(excess))
     return found
 
 
