@@ -5,6 +5,13 @@ from ._air import Air as Air
 from ._ball import Ball as Ball, BallState as BallState
 from ._box import Box as Box, Rectangle as Rectangle
 from ._design import Design as Design, design as design
+from ._diagnostics import (
+    energy as energy,
+    law_residual as law_residual,
+    momentum_about as momentum_about,
+    slip as slip,
+    weak_residual as weak_residual,
+)
 from ._goal import AbstractGoal as AbstractGoal, HitTarget as HitTarget, Land as Land, ReturnTo as ReturnTo
 from ._impact import collide as collide, projector as projector
 from ._lagrangian import Barrier as Barrier, LagrangianSystem as LagrangianSystem
