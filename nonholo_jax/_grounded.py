@@ -3,7 +3,7 @@ and leaves faces over their edges. Rolling is a phase of the same motion, on the
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -60,6 +60,7 @@ class Grounded(AbstractSystem):
     scene: Scene
     tolerance: float = eqx.field(static=True)
     hits: bool = eqx.field(static=True)
+    is_long: ClassVar[bool] = False
 
     def __init__(self, scene: Scene, tolerance: float = 0.0, hits: bool = True):
         self.scene, self.tolerance, self.hits = scene, tolerance, hits
@@ -347,8 +348,8 @@ class Grounded(AbstractSystem):
     def is_admissible(self, time, state):
         return self.scene.is_admissible(time, state.flight)
 
-    def received(self, state, batch):
-        return self.scene.received(state, batch)
+    def received(self, state, batch, t0):
+        return self.scene.received(state, batch, t0)
 
     def unpacked(self, state, phase=None):
         flight = self.scene.unpacked(state)

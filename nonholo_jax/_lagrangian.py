@@ -251,11 +251,11 @@ class LagrangianSystem(AbstractSystem):
         q = q if self.retraction is None else self.retraction(q)
         return q, self._projected(q, v, time)
 
-    def follows(self, contact, time, state, left, rests):
+    def follows(self, contact, time, state, left, rests, ends):
         q, v = state
         fits = [fit(self, i, time, q, v.shape[0]) for i in range(self.n_contacts)]
         fitting = jnp.stack([jnp.all(jnp.stack([holds for holds, _ in each.values()])) for each in fits])
-        kind, fault = bounces(rests)
+        kind, fault = bounces(ends)
         return kind, RESULTS.where(fitting[contact], fault, RESULTS.barrier_conflict)
 
     def impact(self, contact, time, state, kind):
@@ -276,6 +276,18 @@ class LagrangianSystem(AbstractSystem):
             offsets.append(offset)
         b, c = jnp.concatenate(blocks), jnp.concatenate(offsets)
         return (q, collide(v, self.metric_at(q), b, restitution, c)), 0.0
+
+    def during(self, contact, time, state, elapsed):
+        return state
+
+    def named(self, contact, state):
+        return contact
+
+    def is_at_rest(self, contact, time, before, after):
+        return jnp.asarray(False)
+
+    def prepared(self, time, state):
+        return state
 
     def phase(self, state):
         return jnp.asarray(-1, dtype=jnp.int32)
