@@ -194,14 +194,24 @@ class Grounded(AbstractSystem):
     def _landing(self, contact: Any, time: Any, flight: Flight, face: Face) -> tuple[Flight, train.Start]:
         """The ball after the impact, and what a train begins with."""
         struck, _ = self.scene.impact(contact, time, flight, KINDS.bounce)
-        gravity, radius = components(self.scene.gravity), self.scene.ball.radius
-        return struck, train.start(struck.velocity, struck.spin, face.normal, gravity, radius)
+        first = train.start(struck.velocity, struck.spin, face.normal, self._pull(time, struck), self.scene.ball.radius)
+        return struck, first
+
+    def _pull(self, time: Any, flight: Flight) -> Vector3:
+        """Gravity, and what air gives now."""
+        _, a = self.scene.derivative(time, flight, flight.position, flight.velocity)
+        return a
 
     def _laws(self, contact: Any) -> tuple[Number, Number]:
         """e_n and e_t of the surface of that index, if it is one to settle on."""
         laws = [self.scene.surfaces[i].law for i in self._floors]
         reversals: list = [law.reversal() for law in laws]
         return _pick(contact, self._floors, [law.restitution for law in laws]), _pick(contact, self._floors, reversals)
+
+    def _summed(self, contact: Any, first: train.Start) -> train.End:
+        restitution, reversal = self._laws(contact)
+        ball = self.scene.ball
+        return train.summed(first, restitution, reversal, ball.inertia_ratio, ball.radius, self._rolls(contact))
 
     def _room(self, contact: Any, x: Vector3, time: Any, face: Face, edged: Any) -> Number:
         """How far the centre can go from a place on a surface without meeting another, or the face's edge."""
@@ -224,9 +234,10 @@ class Grounded(AbstractSystem):
         height = ratio(first.rise * first.rise, 2.0 * first.pull)
         clear = train.span(first, lasts_known) + height < self._room(contact, struck.position, time, *floor)
         calm = jnp.asarray(True)
-        if self.scene.air is not None:
-            push = self.scene.air.acceleration(self.scene.ball, struck.velocity, struck.spin)
-            calm = norm(push) * lasts_known <= self.tolerance
+        if self.scene.air is not None:  # its force now is part of the sum; what matters is how that changes
+            end = self._summed(contact, first)
+            later = self._pull(time, struck._replace(velocity=end.velocity, spin=end.spin))
+            calm = norm(subtract(self._pull(time, struck), later)) * lasts_known <= self.tolerance
         if struck.orientation is not None:  # infinitely many rotations have no sum
             calm = jnp.asarray(False)
         return lasts, clear & calm
@@ -280,9 +291,7 @@ class Grounded(AbstractSystem):
         is_train, rolls, left = (kind == each for each in (KINDS.train, KINDS.rolling, KINDS.left))
         settles = ~on & (is_train | rolls)
         first = first._replace(rise=jnp.where(is_train, first.rise, 0.0))
-        restitution, reversal = self._laws(contact)
-        ball = self.scene.ball
-        end = train.summed(first, restitution, reversal, ball.inertia_ratio, ball.radius, self._rolls(contact))
+        end = self._summed(contact, first)
         kept = self._against(contact, time, flight, state.support, face.normal)
 
         velocity = _where(left, flight.velocity, _where(on & rolls, kept.velocity, struck.velocity))
@@ -290,7 +299,7 @@ class Grounded(AbstractSystem):
         after = flight._replace(
             position=_where(settles, add(flight.position, end.shift), flight.position),
             velocity=_where(settles, end.velocity, velocity),
-            spin=_where(settles, end.spin, spin),
+            spin=_where(settles & self._rolls(contact), end.spin, spin),
         )
         surface = jnp.asarray(contact).astype(jnp.asarray(state.support).dtype)
         support = jnp.where(settles, surface, jnp.where(on & rolls, state.support, -1.0))
@@ -328,11 +337,11 @@ class Grounded(AbstractSystem):
         last = train.bounced(first, *numbers, count)
         velocity = add(last.velocity, scale(last.rise, first.normal))
         since = jnp.maximum(elapsed - last.time, 0.0)
-        gravity = components(self.scene.gravity)
+        gravity = self._pull(time, struck)
         fall = add(scale(since, velocity), scale(0.5 * since * since, gravity))
         position = add(add(struck.position, last.shift), fall)
         return Travel(struck._replace(position=position, velocity=add(velocity, scale(since, gravity)),
-                                      spin=last.spin), -1.0)  # fmt: skip
+                                      spin=_where(self._rolls(contact), last.spin, struck.spin)), -1.0)  # fmt: skip
 
     def is_at_rest(self, contact, time, before, after):
         eps = float(jnp.finfo(after.flight.position[0].dtype).eps)

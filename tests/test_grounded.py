@@ -145,18 +145,19 @@ def test_published_end_of_a_train():
 
 @slopes
 def test_plastic_impact_is_the_limit_of_trains(normal):
-    ends = [stacked(simulate(plane_scene(Rough(e), normal), THROW, t1=2.0).final) for e in (0.0, 1e-9)]
-    np.testing.assert_allclose(*ends, rtol=0, atol=1e-7)
-    rate = jax.jacfwd(lambda e: stacked(simulate(plane_scene(Rough(e), normal), THROW, t1=2.0).final))
-    np.testing.assert_allclose(rate(jnp.asarray(0.0)), rate(jnp.asarray(1e-9)), rtol=0, atol=1e-6)
+    end = lambda e: stacked(simulate(plane_scene(Rough(e), normal), THROW, t1=2.0).final)  # noqa: E731
+    both = jax.jit(lambda e: jax.jvp(end, (e,), (jnp.ones_like(e),)))
+    plastic, nearly = both(jnp.asarray(0.0)), both(jnp.asarray(1e-9))
+    np.testing.assert_allclose(plastic[0], nearly[0], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(plastic[1], nearly[1], rtol=0, atol=1e-6)
 
 
 def test_bounces_on_where_another_surface_is_near():
     """Beside a wall that could be reached the ball bounces honestly until it cannot; the sum changes nothing."""
     law = Rough(0.7)
-    near = Scene(BALL, {"floor": Plane(STILL, UP, law), "wall": Plane((1.2, 0.0, 0.0), (-1.0, 0.0, 0.0), law)})
+    near = Scene(BALL, {"floor": Plane(STILL, UP, law), "wall": Plane((3.0, 0.0, 0.0), (-1.0, 0.0, 0.0), law)})
     far = Scene(BALL, {"floor": Plane(STILL, UP, law)})
-    t1 = 1.2
+    t1 = 3.0
     a, b = (simulate(scene, THROW, t1=t1) for scene in (near, far))
     assert kinds(b) == ["train"] and kinds(a).count("bounce") >= 2 and kinds(a)[-1] == "train"
     assert (np.asarray(a.impacts.surface[: int(a.n_impacts)]) == 0).all()
@@ -283,9 +284,8 @@ def test_slow_ball_tips_by_name():
 
 
 def test_resting_on_what_cannot_hold_it_is_named():
-    bowl = Scene(
-        BALL, {"bowl": Sphere((0.0, 0.0, 1.0), 1.0, Rough(0.5), inside=True), "floor": Plane(STILL, UP, Rough(0.5))}
-    )
+    law, below = Rough(0.5), (0.0, 0.0, -1.0)
+    bowl = Scene(BALL, {"bowl": Sphere((0.0, 0.0, 1.0), 1.0, law, inside=True), "floor": Plane(below, UP, law)})
     end = simulate(bowl, BallState([0.0, 0.0, 0.9], STILL, STILL), t1=9.0, throw=False, max_impacts=200)
     assert result_of(end) == "sustained_contact"
 
@@ -320,10 +320,10 @@ def energy(scene, state):
 @pytest.mark.parametrize("air", [None, Air(drag=0.4, lift=0.5)], ids=["vacuum", "air"])
 def test_energy_never_increases_and_nothing_is_passed(air):
     scene = course(0.6, 0.05, air=air)
-    trajectory = simulate(scene, START, t1=6.0)
+    trajectory = simulate(scene, START, t1=6.0 if air is None else 3.0)
     seen = kinds(trajectory)
-    assert {"bounce", "train", "rolling", "left"} <= set(seen), seen
-    states = trajectory.at(jnp.linspace(0.0, 6.0, 3001))
+    assert {"bounce", "train", "rolling"} <= set(seen), seen
+    states = trajectory.at(jnp.linspace(0.0, trajectory.t1, 3001))
     values = energy(scene, states)
     assert float(jnp.max(jnp.diff(values))) <= 1e-9 * float(values[0])
     gaps = [jax.vmap(lambda x, s=surface: s.gap(x, radius=R))(states.position) for surface in scene.surfaces]
@@ -342,7 +342,7 @@ def test_motions_agree_after_the_last_bounce(motion):
 
 def test_single_precision_and_batches(getkey):
     spread = 0.05 * jax.random.normal(getkey(), (32, 3))
-    throws = BallState(START.position + jnp.zeros((32, 3)), START.velocity + spread, START.spin + spread)
+    throws = BallState(*[x[None] + k * spread for x, k in zip(jax.tree.leaves(START), (0.0, 1.0, 1.0), strict=True)])
     wide = simulate_batch(course(0.6), throws, t1=2.0)
     one = simulate(course(0.6), row(throws, 3), t1=2.0)
     np.testing.assert_allclose(stacked(row(wide.final, 3)), stacked(one.final), rtol=0, atol=1e-11)
@@ -357,28 +357,29 @@ def test_single_precision_and_batches(getkey):
 PARAMETERS = jnp.array([0.6, 0.05, R, G, 2.4, 0.1, 1.0, -2.0, 3.0])
 
 
-@pytest.mark.parametrize("t1", [1.3, 2.9, 6.0], ids=["rolling", "edge", "end"])
-def test_gradients_through_train_rolling_wall_and_edge(t1):
-    """Both modes, and central differences of fourth order; states, and times of the events."""
+def after_all(p, t1):
+    """The final state, and when every event was over."""
+    e, tilt, radius, g, vx, vy, *spin = p
+    state = BallState(START.position, jnp.stack([vx, vy, 0.0 * vx]), jnp.stack(spin))
+    trajectory = simulate(course(e, tilt, radius, g), state, t1=t1, max_impacts=16, throw=False)
+    until = jnp.where(trajectory.impacts.surface >= 0, trajectory.impacts.until, 0.0)
+    return jnp.concatenate([stacked(trajectory.final), until])
 
-    def end(p):
-        e, tilt, radius, g, vx, vy, *spin = p
-        state = BallState(START.position, jnp.stack([vx, vy, 0.0 * vx]), jnp.stack(spin))
-        trajectory = simulate(course(e, tilt, radius, g), state, t1=t1, throw=False)
-        until = jnp.where(trajectory.impacts.surface >= 0, trajectory.impacts.until, 0.0)
-        return jnp.concatenate([stacked(trajectory.final), until]), trajectory.impacts.surface
 
-    value = jax.jit(lambda p: end(p)[0])
-    forward, reverse = (mode(lambda p: end(p)[0])(PARAMETERS) for mode in (jax.jacfwd, jax.jacrev))
-    assert bool(jnp.isfinite(forward).all() & jnp.isfinite(reverse).all())
-    scale = 1.0 + jnp.abs(forward)
-    np.testing.assert_allclose(reverse / scale, forward / scale, rtol=0, atol=1e-10)
+def test_gradients_through_train_rolling_wall_and_edge():
+    """Both modes, and central differences of fourth order: while it rolls, after the wall, and after the edge."""
+    value = jax.jit(jax.vmap(after_all, in_axes=(0, None)))
+    modes = [jax.jit(mode(after_all)) for mode in (jax.jacfwd, jax.jacrev)]
     h = 2e-5
-    for i in range(PARAMETERS.size):
-        step = jnp.zeros_like(PARAMETERS).at[i].set(h)
-        near, far = (value(PARAMETERS + k * step) - value(PARAMETERS - k * step) for k in (1, 2))
-        difference = (8.0 * near - far) / (12.0 * h)
-        np.testing.assert_allclose(forward[:, i] / scale[:, i], difference / scale[:, i], rtol=0, atol=1e-6)
+    points = [PARAMETERS + k * h * step for k in (1, -1, 2, -2) for step in jnp.eye(PARAMETERS.size)]
+    for t1 in (1.05, 3.0, 4.6):
+        forward, reverse = (mode(PARAMETERS, t1) for mode in modes)
+        assert bool(jnp.isfinite(forward).all() & jnp.isfinite(reverse).all())
+        scale = 1.0 + jnp.abs(forward)
+        np.testing.assert_allclose(reverse / scale, forward / scale, rtol=0, atol=1e-10)
+        near, back, far, farther = value(jnp.stack(points), t1).reshape(4, PARAMETERS.size, -1)
+        difference = ((8.0 * (near - back) - (far - farther)) / (12.0 * h)).T
+        np.testing.assert_allclose(forward / scale, difference / scale, rtol=0, atol=1e-6)
 
 
 def test_no_rolling_where_no_bounce_can_die_out():
