@@ -39,7 +39,7 @@ def _array(x: Any, like: Array) -> Array:
     return jnp.stack([jnp.asarray(c, dtype=like.dtype) for c in x]) if isinstance(x, tuple) else x.astype(like.dtype)
 
 
-def energy(system: Scene | LagrangianSystem, state: Any) -> Float[Array, "*batch"]:
+def energy(system: Any, state: Any) -> Float[Array, "*batch"]:
     """Kinetic and potential energy, in J.
 
     **Arguments:**
@@ -134,7 +134,7 @@ def _row(system: LagrangianSystem, index: int, time: Array, before: Any, after: 
     return jnp.sqrt(jnp.sum((new + barrier.restitution * old) ** 2)), jnp.sqrt(jnp.sum(old**2))
 
 
-def law_residual(system: Scene | LagrangianSystem, trajectory: Trajectory) -> Float[Array, ""]:
+def law_residual(system: Any, trajectory: Trajectory) -> Float[Array, ""]:
     """By how much the impacts of a motion miss the law: the largest |B v+ - c + mu (B v- - c)| / |B v- - c|.
 
     **Arguments:**
@@ -179,7 +179,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
 def weak_residual(
-    system: LagrangianSystem, trajectory: Trajectory, *, n_functions: int = 8, key: Any = None, panels: int = 8
+    system: Any, trajectory: Trajectory, *, n_functions: int = 8, key: Any = None, panels: int = 8
 ) -> Float[Array, ""]:
     """By how much a motion misses the paper's definition of a weak solution, Definition 1.
 

@@ -6,9 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ._polynomial import Interval, Window, evaluate, product
+from ._polynomial import Interval, Window, evaluate
 from ._types import Number
-from ._vector import components, is_constant, maximum, minimum, norm, plus, ratio, slope, times, total
+from ._vector import components, is_constant, maximum, minimum, norm, plus, ratio, slope, times
 
 _SAMPLES = (0.0, 0.25, 0.5, 0.75, 1.0)
 _FAR = 1e12  # no window is longer
@@ -36,14 +36,15 @@ def bend_of(gap: Callable, curvature: Number | None, window: Window) -> Interval
     if curvature is None:
         return _sampled(gap, window)
     start = tuple(p[0] for p in window.coefficients)
+    along = window.along(gradient_of(gap, start), start).bend
+    if is_constant(curvature) and curvature == 0:
+        return along
     tracks = [window.track(p) for p in window.coefficients]
     fastest = norm([maximum(abs(track.rate.low), abs(track.rate.high)) for track in tracks])
     hardest = norm([maximum(abs(track.bend.low), abs(track.bend.high)) for track in tracks])
-    along = [product(Interval(g, g), track.bend) for g, track in zip(gradient_of(gap, start), tracks, strict=True)]
     # v . H v, and what the gradient can turn by within the window, times the acceleration.
-    turned = times(times(curvature, times(fastest, window.width)), hardest)
-    margin = plus(times(curvature, fastest * fastest), turned)
-    return Interval(total([x.low for x in along]) - margin, total([x.high for x in along]) + margin)
+    margin = plus(times(curvature, fastest * fastest), times(times(curvature, times(fastest, window.width)), hardest))
+    return Interval(along.low - margin, along.high + margin)
 
 
 def _sampled(gap: Callable, window: Window) -> Interval:

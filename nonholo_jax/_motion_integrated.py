@@ -181,30 +181,37 @@ def _unrolled_stages(tableau: Any, system: Any, time: Any, state: Any, h: Any) -
 
 
 def _stages_in_turn(tableau: Any, system: Any, time: Any, state: Any, h: Any) -> tuple[list, list]:
-    """The same by a loop, which holds the system's derivative once: a long one compiles several times as fast."""
-    (q, v), count = system.evolving(state), tableau.num_stages
-    n, z0 = len(q), jnp.stack([jnp.asarray(x, dtype=time.dtype) for x in (*q, *v)])
+    """The same by a loop, which holds the system's derivative once, and over two arrays, q and v: where the derivative
+    is a long program, it compiles several times as fast."""
+    (q, v), count = (_joined(x, time) for x in system.evolving(state)), tableau.num_stages
     weights, nodes = np.zeros((count, count)), np.zeros(count)
     for i in range(1, count):
         weights[i, :i], nodes[i] = tableau.a_lower[i - 1], tableau.c[i - 1]
 
     def stage(slopes, each):
         index, row, c = each
-        z = z0 + h * jnp.sum(row[:, None] * slopes, axis=0)
-        dq, dv = system.derivative(time + c * h, state, tuple(z[:n]), tuple(z[n:]))
-        slope = jnp.stack([jnp.asarray(x, dtype=time.dtype) for x in (*dq, *dv)])
-        return slopes.at[index].set(slope), None
+        z = [x + h * jnp.sum(row[:, None] * slope, axis=0) for x, slope in zip((q, v), slopes, strict=True)]
+        rates = system.derivative(time + c * h, state, *(tuple(x) for x in z))
+        return tuple(x.at[index].set(_joined(rate, time)) for x, rate in zip(slopes, rates, strict=True)), None
 
     plan = (jnp.arange(count), jnp.asarray(weights, dtype=time.dtype), jnp.asarray(nodes, dtype=time.dtype))
-    slopes, _ = jax.lax.scan(stage, jnp.zeros((count, z0.size), time.dtype), plan)
-    return [tuple(h * k) for k in slopes], [tuple(k[:n]) for k in slopes]
+    start = tuple(jnp.zeros((count, x.size), time.dtype) for x in (q, v))
+    (rates, others), _ = jax.lax.scan(stage, start, plan)
+    return [(h * rates[i], h * others[i]) for i in range(count)], [(rates[i],) for i in range(count)]
+
+
+def _joined(x: Any, like: Any) -> Any:
+    return jnp.stack([jnp.asarray(c, dtype=like.dtype) for c in x])
 
 
 def _runge_kutta_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -> Piece:
     """One step of an explicit Runge-Kutta method and its interpolant."""
     tableau, (q, v) = solver.tableau, system.evolving(state)
+    make, split = _unrolled_stages, tuple
+    if system.is_long:  # the same arithmetic on two arrays instead of many scalars
+        make, split = _stages_in_turn, lambda blocks: tuple(c for block in blocks for c in block)
+        q, v = (_joined(q, time),), (_joined(v, time),)
     n, z0 = len(q), (*q, *v)
-    make = _stages_in_turn if system.is_long else _unrolled_stages
     stages, rates = make(tableau, system, time, state, h)
     columns = [[k[j] for k in stages] for j in range(len(z0))]
     steps = shared([_combination(tableau.b_sol, column) for column in columns])
@@ -213,18 +220,20 @@ def _runge_kutta_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -
     weights = interpolation_weights(solver)
     if len(weights) == 2 and not tableau.fsal:
         means = [_combination(tableau.b_sol, column) for column in zip(*rates, strict=True)]
-        ends, _ = system.derivative(time + h, state, z1[:n], z1[n:])
+        ends, _ = system.derivative(time + h, state, split(z1[:n]), split(z1[n:]))
+        ends = (_joined(ends, time),) if system.is_long else ends
         path = tuple(_cubic(*each, h) for each in zip(q, rates[0], ends, means, strict=True))
         rate = tuple(_quadratic(*each) for each in zip(v, stages[0][n:], z1[n:], strict=True))
-        return Piece(Arc(time, state, path, rate, jnp.ones_like(h), h), None, (z0, z1, error))
-    polynomials = []
-    for x, step, column in zip(z0, steps, columns, strict=True):
-        inner = shared([_combination(row, column) for row in weights])
-        # The last coefficient makes the polynomial end where the step ends, to rounding.
-        polynomials.append((x, *inner, plus(step, times(-1.0, total(inner)))))
-    one = jnp.ones_like(h)
-    arc = Arc(time, state, tuple(polynomials[:n]), tuple(polynomials[n:]), one, h)
-    return Piece(arc, None, (z0, z1, error))
+    else:
+        polynomials = []
+        for x, step, column in zip(z0, steps, columns, strict=True):
+            inner = shared([_combination(row, column) for row in weights])
+            # The last coefficient makes the polynomial end where the step ends, to rounding.
+            polynomials.append((x, *inner, plus(step, times(-1.0, total(inner)))))
+        path, rate = tuple(polynomials[:n]), tuple(polynomials[n:])
+    if system.is_long:
+        path, rate = (tuple(zip(*part[0], strict=True)) for part in (path, rate))
+    return Piece(Arc(time, state, path, rate, jnp.ones_like(h), h), None, (split(z0), split(z1), split(error)))
 
 
 def _cubic(q0: Any, rate0: Any, rate1: Any, mean: Any, h: Any) -> tuple:

@@ -9,6 +9,7 @@ Scalar: TypeAlias = Float[Array, ""]
 Vector: TypeAlias = Float[Array, "3"]
 Quaternion: TypeAlias = Float[Array, "4"]
 Number: TypeAlias = float | Scalar
+Numbers: TypeAlias = float | Float[Array, "..."]  # one number, or an array of them that is computed with as one
 Vector3: TypeAlias = tuple[Number, Number, Number]
 """Inside the engine a vector is three scalars: under `vmap` each is one contiguous array, and a component that is a
 Python number is a constant of the program."""

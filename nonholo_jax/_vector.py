@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._types import Number, Vector3
+from ._types import Number, Numbers, Vector3
 
 
 def is_constant(x: Any) -> bool:
@@ -64,7 +64,7 @@ def pack(x: Sequence, like: Any) -> Float[Array, " n"]:
     return jnp.stack([jnp.asarray(item, dtype=like.dtype) for item in x], axis=-1)
 
 
-def times(a: Number, b: Number) -> Number:
+def times(a: Numbers, b: Numbers) -> Numbers:
     for x, y in ((a, b), (b, a)):
         if is_constant(x):
             if x == 0:
@@ -76,7 +76,7 @@ def times(a: Number, b: Number) -> Number:
     return a * b
 
 
-def plus(a: Number, b: Number) -> Number:
+def plus(a: Numbers, b: Numbers) -> Numbers:
     if is_constant(a) and a == 0:
         return b
     if is_constant(b) and b == 0:
@@ -84,8 +84,8 @@ def plus(a: Number, b: Number) -> Number:
     return a + b
 
 
-def total(terms: Sequence[Number]) -> Number:
-    result: Number = 0.0
+def total(terms: Sequence[Numbers]) -> Numbers:
+    result: Numbers = 0.0
     for term in terms:
         result = plus(result, term)
     return result
