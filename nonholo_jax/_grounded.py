@@ -191,11 +191,9 @@ class Grounded(AbstractSystem):
         """The face that the ball is on, or else that of the surface that it hits; and whether it has edges."""
         return self._face(jnp.where(state.support >= 0, self.phase(state), contact), state.flight.position, time)
 
-    def _landing(self, contact: Any, time: Any, flight: Flight, face: Face) -> tuple[Flight, train.Start]:
-        """The ball after the impact, and what a train begins with."""
-        struck, _ = self.scene.impact(contact, time, flight, KINDS.bounce)
-        first = train.start(struck.velocity, struck.spin, face.normal, self._pull(time, struck), self.scene.ball.radius)
-        return struck, first
+    def _start(self, time: Any, struck: Flight, face: Face) -> train.Start:
+        """What a train begins with, after the first impact."""
+        return train.start(struck.velocity, struck.spin, face.normal, self._pull(time, struck), self.scene.ball.radius)
 
     def _pull(self, time: Any, flight: Flight) -> Vector3:
         """Gravity, and what air gives now."""
@@ -253,20 +251,23 @@ class Grounded(AbstractSystem):
             stays.append(jnp.where(rolls & jnp.asarray(common), 1.0, 0.0) if law.rolls else float(law.rolls is False))
         return jnp.asarray(select(contact, stays)) > 0.5
 
-    def follows(self, contact, time, state, left, rests, ends):
-        flight, on = state.flight, state.support >= 0
+    def bounced(self, contact, time, state):
+        return Travel(self.scene.bounced(contact, time, state.flight), state.support)
+
+    def follows(self, contact, time, state, bounced, left, rests, ends):
+        on, struck = state.support >= 0, bounced.flight
         is_exit = contact >= len(self.scene.surfaces)
         floor = self._floor(contact, time, state)
-        struck, first = self._landing(contact, time, flight, floor[0])
+        first = self._start(time, struck, floor[0])
         restitution, reversal = self._laws(contact)
         is_floor = jnp.any(jnp.stack([contact == i for i in self._floors])) & floor[0].below & (first.pull > 0)
         lasts, sums = self._sums(contact, time, struck, first, floor)
-        ends = is_floor & (lasts <= left) & (sums | rests)
+        dies_out = is_floor & (lasts <= left) & (sums | rests)
         moves = dot(first.slip, first.slip) + dot(first.along, first.along) > 0
-        endless = ends & self._rolls(contact) & (abs(reversal) == 1) & (restitution < 1) & moves
+        endless = dies_out & self._rolls(contact) & (abs(reversal) == 1) & (restitution < 1) & moves
         lies = is_floor & rests
 
-        bounce_or_end = KINDS.where(ends, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
+        bounce_or_end = KINDS.where(dies_out, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
         wall = KINDS.where(self._stays(contact, state.support), KINDS.rolling, KINDS.bounce)
         kind = KINDS.where(on, KINDS.where(is_exit, KINDS.left, wall), bounce_or_end)
 
@@ -284,10 +285,10 @@ class Grounded(AbstractSystem):
         pull = times(-1.0, dot(face.normal, components(self.scene.gravity)))
         return speed * speed < pull * self.scene.ball.radius * (1.0 + 1e-5)
 
-    def impact(self, contact, time, state, kind):
-        flight, on = state.flight, state.support >= 0
+    def impact(self, contact, time, state, bounced, kind):
+        flight, on, struck = state.flight, state.support >= 0, bounced.flight
         face, _ = self._floor(contact, time, state)
-        struck, first = self._landing(contact, time, flight, face)
+        first = self._start(time, struck, face)
         is_train, rolls, left = (kind == each for each in (KINDS.train, KINDS.rolling, KINDS.left))
         settles = ~on & (is_train | rolls)
         first = first._replace(rise=jnp.where(is_train, first.rise, 0.0))
@@ -329,7 +330,8 @@ class Grounded(AbstractSystem):
     def during(self, contact, time, state, elapsed):
         """The state so long after the first impact of a train."""
         face, _ = self._face(contact, state.flight.position, time)
-        struck, first = self._landing(contact, time, state.flight, face)
+        struck = self.scene.bounced(contact, time, state.flight)
+        first = self._start(time, struck, face)
         restitution, reversal = self._laws(contact)
         count = train.bounces_within(first, restitution, elapsed)
         ball = self.scene.ball

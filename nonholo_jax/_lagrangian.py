@@ -251,14 +251,17 @@ class LagrangianSystem(AbstractSystem):
         q = q if self.retraction is None else self.retraction(q)
         return q, self._projected(q, v, time)
 
-    def follows(self, contact, time, state, left, rests, ends):
+    def follows(self, contact, time, state, bounced, left, rests, ends):
         q, v = state
         fits = [fit(self, i, time, q, v.shape[0]) for i in range(self.n_contacts)]
         fitting = jnp.stack([jnp.all(jnp.stack([holds for holds, _ in each.values()])) for each in fits])
         kind, fault = bounces(ends)
         return kind, RESULTS.where(fitting[contact], fault, RESULTS.barrier_conflict)
 
-    def impact(self, contact, time, state, kind):
+    def impact(self, contact, time, state, bounced, kind):
+        return bounced, 0.0
+
+    def bounced(self, contact, time, state):
         """(6.1), with the rows of every barrier of the same restitution that is hit at this instant."""
         q, v = state
         restitution = select(contact, [jnp.asarray(barrier.restitution, q.dtype) for barrier in self.barriers])
@@ -275,7 +278,7 @@ class LagrangianSystem(AbstractSystem):
             blocks.append(rows)
             offsets.append(offset)
         b, c = jnp.concatenate(blocks), jnp.concatenate(offsets)
-        return (q, collide(v, self.metric_at(q), b, restitution, c)), 0.0
+        return q, collide(v, self.metric_at(q), b, restitution, c)
 
     def during(self, contact, time, state, elapsed):
         return state

@@ -198,8 +198,9 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     kind, fault, after, pause, name = KINDS.unused, RESULTS.reached_t1, arrived, 0.0, found.contact
     if system.n_contacts > 0:
         name = system.named(found.contact, arrived)
-        kind, fault = system.follows(found.contact, time, arrived, t1 - time, resting, ends)
-        after, pause = system.impact(found.contact, time, arrived, kind)
+        bounced = system.bounced(found.contact, time, arrived)
+        kind, fault = system.follows(found.contact, time, arrived, bounced, t1 - time, resting, ends)
+        after, pause = system.impact(found.contact, time, arrived, bounced, kind)
         after = _arrays(after, t1.dtype)
     failed = fault != RESULTS.reached_t1
     stopped = crossed & (failed | full | stuck)
@@ -309,7 +310,8 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         struck = crossed & (n_impacts < known.n_impacts)
         after, until = arrived, moved
         if system.n_contacts > 0:
-            other, pause = system.impact(contact, moved, arrived, kind_of(code))
+            bounced = system.bounced(contact, moved, arrived)
+            other, pause = system.impact(contact, moved, arrived, bounced, kind_of(code))
             after = _keep(struck, _arrays(other, t1.dtype), arrived)
             until = jnp.where(struck, moved + pause, moved)
         row = pack_row(Row(moved, until, since + elapsed, arrived, after)) if log_rows else jnp.zeros((0,), t1.dtype)

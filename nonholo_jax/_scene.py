@@ -4,11 +4,14 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from ._air import Air
 from ._ball import Ball, BallState, check_ball_state
+from ._corner import collide_with_all, is_one_mu
 from ._polynomial import Window
 from ._rotation import turned
 from ._shared import shared
@@ -28,6 +31,7 @@ from ._vector import (
     select_vector,
     subtract,
     times,
+    total,
 )
 
 
@@ -120,7 +124,7 @@ class Scene(AbstractSystem):
             orientation = turned(orientation, angle)
         return Flight(q, v, state.spin, orientation)
 
-    def follows(self, contact, time, state, left, rests, ends):
+    def follows(self, contact, time, state, bounced, left, rests, ends):
         return bounces(ends)
 
     def during(self, contact, time, state, elapsed):
@@ -135,8 +139,39 @@ class Scene(AbstractSystem):
     def phase(self, state):
         return jnp.asarray(-1, dtype=jnp.int32)
 
-    def impact(self, contact, time, state, kind):
-        """Theorem 5.2 for any normal and any law."""
+    def impact(self, contact, time, state, bounced, kind):
+        return bounced, 0.0
+
+    def bounced(self, contact, time, state):
+        """Theorem 5.2 for any normal and any law; at a corner, (4.2) for all that is hit if that has one mu."""
+        single = self._single_impact(contact, time, state)
+        alike = [i for i, surface in enumerate(self.surfaces) if is_one_mu(surface.law)]
+        if len(alike) < 2:
+            return single
+        hits = [self._is_hit_with(contact, i, time, state) for i in alike]
+        several = total([jnp.where(hit, 1.0, 0.0) for hit in hits]) > 1.5
+
+        def at_corner(_):
+            surfaces = [self.surfaces[i] for i in alike]
+            laws, normals = [each.law for each in surfaces], [each.direction(state.position, time) for each in surfaces]
+            mu = select(contact, [surface.law.restitution for surface in self.surfaces])
+            velocity, spin = collide_with_all(self.ball, laws, normals, hits, mu, state.velocity, state.spin)
+            return as_arrays(state._replace(velocity=velocity, spin=spin))
+
+        as_arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=time.dtype), tree)  # noqa: E731
+        corner = lax.cond(eqxi.unvmap_any(several), at_corner, lambda one: one, as_arrays(single))
+        return jax.tree.map(lambda a, b: jnp.where(several, a, b), corner, single)
+
+    def _is_hit_with(self, contact: Any, other: int, time: Any, state: Flight) -> Any:
+        """Whether a surface is touched and closed in on when another one is hit that has the same mu."""
+        surface, x = self.surfaces[other], state.position
+        touches = abs(self.level(other, time, x, state)) <= 16.0 * rounding(self, other, x)
+        closes = dot(surface.direction(x, time), state.velocity) < 0
+        mu = select(contact, [each.law.restitution for each in self.surfaces])
+        known = jnp.any(jnp.stack([contact == i for i, each in enumerate(self.surfaces) if is_one_mu(each.law)]))
+        return known & ((contact == other) | (touches & closes & jnp.asarray(surface.law.restitution == mu)))
+
+    def _single_impact(self, contact, time, state):
         ball, x = self.ball, state.position
         n = shared(select_vector(contact, [surface.direction(x, time) for surface in self.surfaces]))
         e_n = select(contact, [surface.law.restitution for surface in self.surfaces])
@@ -150,7 +185,7 @@ class Scene(AbstractSystem):
         kick = add(scale(rebound, n), scale(s, slip))
         twist = times(s, ratio(1.0, times(ball.inertia_ratio, ball.radius)))
         spin = add(state.spin, scale(twist, cross(n, tuple(slip))))
-        return Flight(x, subtract(state.velocity, kick), spin, state.orientation), 0.0
+        return Flight(x, subtract(state.velocity, kick), spin, state.orientation)
 
     def level(self, contact, time, q, state):
         return self.surfaces[contact].level(q, time, self.ball.radius)

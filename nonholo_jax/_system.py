@@ -42,15 +42,19 @@ class AbstractSystem(eqx.Module):
         """The state at `time`, after smooth motion from `state` to (q, v) during `duration` seconds."""
 
     @abstractmethod
+    def bounced(self, contact: Index, time: Scalar, state: Any) -> Any:
+        """The state after an impact on the contact of that index, if nothing but a bounce follows."""
+
+    @abstractmethod
     def follows(
-        self, contact: Index, time: Scalar, state: Any, left: Scalar, rests: Any, ends: Any
+        self, contact: Index, time: Scalar, state: Any, bounced: Any, left: Scalar, rests: Any, ends: Any
     ) -> tuple[KINDS, RESULTS]:
         """What follows when a contact is crossed in `state`, `left` seconds before the end, and whether the motion can
         go on (`RESULTS.reached_t1`) or why not. `rests` says that a bounce would not rise above rounding, `ends` that
         it could not even be computed."""
 
     @abstractmethod
-    def impact(self, contact: Index, time: Scalar, state: Any, kind: KINDS) -> tuple[Any, Scalar | float]:
+    def impact(self, contact: Index, time: Scalar, state: Any, bounced: Any, kind: KINDS) -> tuple[Any, Scalar | float]:
         """The state after crossing a contact, given what follows, and how many seconds have passed by then."""
 
     @abstractmethod

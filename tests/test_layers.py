@@ -30,6 +30,7 @@ ORDER = [
     "_box",
     "_round",
     "_air",
+    "_corner",
     "_scene",
     "_train",
     "_grounded",
