@@ -13,10 +13,9 @@ from ._impact import _dot, _whiten, projector
 from ._lagrangian import LagrangianSystem, as_arrays
 from ._loop import run
 from ._scene import Scene
-from ._system import rounding
 from ._trajectory import Trajectory
 from ._types import KINDS, RESULTS
-from ._vector import components, select
+from ._vector import select
 
 
 def _refuse_system(system: Any) -> None:
@@ -202,7 +201,7 @@ def weak_residual(
     ```python
     import jax.numpy as jnp
     from nonholo_jax import Barrier, Integrated, LagrangianSystem, simulate, weak_residual
-    wall = Barrier(lambda q: q[0], lambda q: jnp.array([[1.0, 0.3]]), curvature=0.0)
+    wall = Barrier(lambda q: q[0] + 0.3 * q[1], lambda q: jnp.array([[1.0, 0.3]]), curvature=0.0)
     system = LagrangianSystem(metric=lambda q: jnp.eye(2), barriers=[wall])
     motion = Integrated(rtol=1e-6, atol=1e-6)
     weak_residual(system, simulate(system, ([1.0, 0.0], [-2.0, 1.0]), t1=1.0, motion=motion))
@@ -245,8 +244,7 @@ def _pulse(system: LagrangianSystem, t: Array, q: Array, contact: Array, noise: 
     metric = system.metric_at(q)
     blocks = []
     for i, barrier in enumerate(system.barriers):
-        touched = (contact == i) | (jnp.abs(barrier.gap(q)) <= 64.0 * rounding(system, i, components(q)))
-        blocks.append(jnp.where(touched, barrier.constraint(q), 0.0))
+        blocks.append(jnp.where((contact == i) | system.touches(i, q), barrier.constraint(q), 0.0))
     e = noise / jnp.sqrt(jnp.diagonal(metric))[None, :]
     return e - _dot(e, projector(metric, jnp.concatenate(blocks)).T)
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ._checks import conditions, fit, refuse, refuse_shapes
 from ._gap import bend_of, gradient_of, reach_of, value_of
 from ._impact import _dot, accelerate, collide, settle
-from ._system import AbstractSystem, bounces, rounding
+from ._system import AbstractSystem, bounces
 from ._types import RESULTS, Number
 from ._vector import as_number, components, frozen, is_constant, select
 
@@ -88,8 +88,8 @@ class LagrangianSystem(AbstractSystem):
     """A mechanical system given by its Lagrangian, with constraints linear in the velocities, and barriers.
 
     Motion is that of Lagrange and d'Alembert; at a barrier v+ = v - (1 + mu) G^-1 B^T (B G^-1 B^T)^+ (B v - c), and
-    barriers of equal restitution that are hit at one instant act as one, with their rows of B stacked. All derivatives
-    are taken by JAX from what is given here.
+    barriers of equal restitution that are hit at one instant (to rounding of 1 + |q|) act as one, with their rows of B
+    stacked. All derivatives are taken by JAX from what is given here.
 
     **Arguments:** functions of the configuration q, shape (n_q,), and the velocity v, shape (n,). They may be
     `equinox.Module`s, whose arrays are then traced and differentiated.
@@ -230,6 +230,12 @@ class LagrangianSystem(AbstractSystem):
         _, rate, a = jax.jvp(excess, (q, t), (w, jnp.ones_like(t)), has_aux=True)
         return w, accelerate(self.metric_at(q), a, force, rate)
 
+    def touches(self, index: int, q: Array) -> Array:
+        """Whether a barrier is in contact at q to rounding. What q was computed from may be larger than q itself, which
+        vanishes at a corner in the origin: coordinates are taken to be of the order of one."""
+        tolerance = 128.0 * float(jnp.finfo(q.dtype).eps) * (1.0 + jnp.sum(jnp.abs(q)))
+        return jnp.abs(self.barriers[index].gap(q)) <= tolerance
+
     # What the event loop asks for
 
     @property
@@ -271,9 +277,8 @@ class LagrangianSystem(AbstractSystem):
             rows = barrier.constraint(q)
             offset = barrier.moves(q, time, rows.shape[0])
             if self.n_contacts > 1:
-                touching = jnp.abs(barrier.gap(q)) <= 16.0 * rounding(self, i, components(q))
                 closing = _dot(jax.grad(barrier.gap)(q), w) < 0
-                hit = (contact == i) | (touching & closing & (barrier.restitution == restitution))
+                hit = (contact == i) | (self.touches(i, q) & closing & (barrier.restitution == restitution))
                 rows, offset = jnp.where(hit, rows, 0.0), jnp.where(hit, offset, 0.0)
             blocks.append(rows)
             offsets.append(offset)

@@ -247,6 +247,12 @@ def _along(q, v):
     return jnp.stack([v[0] * jnp.cos(q[2]) + v[1] * jnp.sin(q[2]), v[2]])
 
 
+def violation(system, q, v):
+    """|A v - b| relative to the velocities."""
+    a, b = system.constraint_at(q, jnp.zeros((), q.dtype), v.shape[0])
+    return float(jnp.max(jnp.abs(a @ v - b), initial=0.0) / (jnp.max(jnp.abs(a) @ jnp.abs(v), initial=0.0) + 1e-300))
+
+
 class SystemCase(NamedTuple):
     name: str
     build: Callable[..., LagrangianSystem]  # build(restitution), or build() where there is no barrier

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import BALL, all_laws, lane, named
-from systems import ALPHA, J, M, R, all_systems, constant, diagonal, knife, thrown_ball
+from systems import ALPHA, J, M, R, all_systems, constant, diagonal, knife, thrown_ball, violation
 
 from nonholo_jax import (
     Ball,
@@ -25,6 +25,7 @@ from nonholo_jax import (
     energy,
     law_residual,
     momentum_about,
+    projector,
     simulate,
     simulate_batch,
     slip,
@@ -51,6 +52,23 @@ def test_right_motions_satisfy_the_weak_form_and_the_law(case):
     assert (int(trajectory.n_impacts) > 0) == (system.n_contacts > 0)
     assert float(weak_residual(system, trajectory)) < 1e-9
     assert float(law_residual(system, trajectory)) < 1e-13
+    for i in range(int(trajectory.n_impacts)):
+        _check_impact(system, 0.8, lane(trajectory.impacts, i))
+
+
+def _check_impact(system, mu, log):
+    """The law of the paper written out, without the library's own residual."""
+    (q, before), (there, after) = log.before, log.after
+    rows, metric = system.barriers[0].constraint(q), system.metric_at(q)
+    c = system.barriers[0].moves(q, log.time, rows.shape[0])
+    scale = float(jnp.max(jnp.abs(rows) @ jnp.abs(before)))
+    np.testing.assert_allclose(rows @ after - c, -mu * (rows @ before - c), atol=1e-14 * scale)
+    np.testing.assert_array_equal(there, q)
+    # (2.9): the jump of the momentum is orthogonal to ker B.
+    free, jump = before - projector(metric, rows) @ before, metric @ (after - before)
+    assert abs(float(jump @ free)) <= 1e-13 * float(jnp.abs(jump) @ jnp.abs(before))
+    assert abs(float(system.barriers[0].gap(q))) < 1e-14
+    assert violation(system, q, after) < 1e-14
 
 
 def normal_only(restitution=1.0):
