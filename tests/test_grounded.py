@@ -387,3 +387,47 @@ def test_no_rolling_where_no_bounce_can_die_out():
     elastic = simulate(plane_scene(Rough()), THROW, t1=0.1)
     assert type(elastic.system) is Scene
     assert bool((elastic.impacts.kind == KINDS.unused)[1:].all())
+
+
+# Corners
+
+
+@pytest.mark.parametrize("wall", [Rough, Smooth], ids=["rough", "smooth"])
+def test_floor_and_wall_hit_at_one_instant(wall):
+    """One impact by the stacked projector, whose rows are dependent; elastic, it conserves energy and undoes itself."""
+
+    def corner(mu):
+        floor, side = Plane(STILL, UP, Rough(mu)), Plane(STILL, (1.0, 0.0, 0.0), wall(mu))
+        return Scene(BALL, {"floor": floor, "wall": side}, gravity=STILL)
+
+    state = BallState([0.6, 0.0, 0.6], [-1.0, 0.3, -1.0], [1.0, 2.0, 3.0])
+    run = jax.jit(lambda mu: simulate(corner(mu), state, t1=0.9, sum_trains=False))
+    metric = jnp.diag(jnp.asarray([1.0] * 3 + [ALPHA * R * R] * 3))
+    blocks = []
+    for n, law in ((UP, Rough), ((1.0, 0.0, 0.0), wall)):
+        full = np.hstack([np.eye(3), -R * np.cross(np.eye(3), n).T])
+        blocks.append(full if law is Rough else np.concatenate([n, np.zeros(3)])[None])
+    before = jnp.concatenate([state.velocity, state.spin])
+    for mu in (1.0, 0.6, 0.0):
+        trajectory = run(mu)
+        assert int(trajectory.n_impacts) == 1
+        after = jnp.concatenate([trajectory.impacts.after.velocity[0], trajectory.impacts.after.spin[0]])
+        want = collide(before, metric, jnp.asarray(np.vstack(blocks)), mu)
+        np.testing.assert_allclose(after, want, rtol=0, atol=1e-13)
+    slow = jax.jacrev(lambda v: simulate(corner(1.0), BallState(state.position, v, state.spin), t1=0.9).final.velocity)
+    assert bool(jnp.isfinite(slow(state.velocity)).all())
+
+
+def test_nearly_at_one_instant_resolves_in_order():
+    """However close two impacts are, each ends as one named motion; with two coefficients they follow one another."""
+    floor = Plane(STILL, UP, Rough(0.8))
+    side = Plane(STILL, (1.0, 0.0, 0.0), Rough(0.9))
+    offsets = jnp.concatenate([jnp.array([0.0]), 10.0 ** jnp.arange(-16.0, -1.0)])
+    position = jnp.array([0.6, 0.0, 0.6]) + offsets[:, None] * jnp.array([1.0, 0.0, 0.0])
+    states = BallState(position, jnp.tile(jnp.array([-1.0, 0.3, -1.0]), (16, 1)), jnp.ones((16, 3)))
+    for law in (floor.law, side.law):
+        scene = Scene(BALL, {"floor": floor, "wall": Plane(STILL, (1.0, 0.0, 0.0), law)}, gravity=STILL)
+        batch = simulate_batch(scene, states, t1=0.9, sum_trains=False)
+        assert results_of(batch) == ["reached_t1"] * 16
+        assert (np.asarray(batch.n_impacts) <= 4).all() and (np.asarray(batch.n_impacts) >= 1).all()
+        assert (np.asarray(batch.final.position[:, ::2]) >= R - 1e-12).all()
