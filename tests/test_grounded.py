@@ -408,7 +408,7 @@ def test_floor_and_wall_hit_at_one_instant(wall):
         full = np.hstack([np.eye(3), -R * np.cross(np.eye(3), n).T])
         blocks.append(full if law is Rough else np.concatenate([n, np.zeros(3)])[None])
     before = jnp.concatenate([state.velocity, state.spin])
-    for mu in (1.0, 0.6, 0.0):
+    for mu in (1.0, 0.6, 0.1):
         trajectory = run(mu)
         assert int(trajectory.n_impacts) == 1
         after = jnp.concatenate([trajectory.impacts.after.velocity[0], trajectory.impacts.after.spin[0]])
