@@ -18,7 +18,7 @@ from ._polynomial import Polynomial, Window, derivative, evaluate, recentred
 from ._shared import shared
 from ._system import AbstractSystem, rounding
 from ._types import Index, Number, Scalar
-from ._vector import frozen, norm, select, slope, times
+from ._vector import dot, frozen, norm, select, slope, subtract, times
 
 
 class Arc(eqx.Module):
@@ -84,13 +84,35 @@ def _is_exact(system: AbstractSystem, contact: int, path: tuple[Polynomial, ...]
     return system.reach(contact, tuple(p[0] for p in path)) is None and all(len(p) <= 3 for p in path)
 
 
-def _returns(system: AbstractSystem, contact: int, arc: Arc) -> Bool[Array, ""]:
-    """Whether an arc begins on a plane: then the search has found the time of return from the velocity alone, and the
-    level there, which is nothing but rounding, could only spoil it by rounding over the speed."""
-    if not _is_exact(system, contact, arc.configuration):
-        return jnp.asarray(False)
+def _return_to_face(system: AbstractSystem, contact: int, arc: Arc) -> tuple[Scalar, Bool[Array, ""]]:
+    """When a parabola that begins on a flat face comes back to it, from the velocity alone, and whether it does. Until
+    then it is on the outer side of the face's plane, so that it cannot have met the surface before."""
+    q = tuple(p[0] for p in arc.configuration)
+    face = system.face(contact, arc.time, q) if all(len(p) <= 3 for p in arc.configuration) else None
+    if face is None:
+        return jnp.asarray(jnp.inf, dtype=arc.time.dtype), jnp.asarray(False)
+    n = face.normal
+    rise = dot(n, tuple(p[1] if len(p) > 1 else 0.0 for p in arc.configuration))
+    pull = -dot(n, tuple(p[2] if len(p) > 2 else 0.0 for p in arc.configuration))
+    falls = jnp.asarray((pull > 0) & (rise > 0) & face.below)
+    s = jnp.where(falls, rise / jnp.where(falls, pull, 1.0), jnp.inf)
+    if face.half is not None:
+        landing = subtract(arc.position(jnp.where(falls, s, 0.0)), face.center)
+        for across, half in zip(face.tangents, face.half, strict=True):
+            falls = falls & (abs(dot(across, landing)) <= half)
+    return s, falls
+
+
+def _returns(system: AbstractSystem, contact: int, arc: Arc, s: Any) -> Bool[Array, ""]:
+    """Whether an arc begins on a plane, or on a flat face to which it comes back at s: then the search has found that
+    time from the velocity alone, and the level there, which is nothing but rounding, could only spoil it by rounding
+    over the speed."""
     q = frozen(tuple(p[0] for p in arc.configuration))
-    return abs(frozen(system.level(contact, arc.time, q, arc.start))) <= rounding(system, contact, q)
+    touches = abs(frozen(system.level(contact, arc.time, q, arc.start))) <= rounding(system, contact, q)
+    if _is_exact(system, contact, arc.configuration):
+        return touches
+    back, falls = frozen(_return_to_face(system, contact, arc))
+    return touches & falls & (abs(s - back) <= 1e-9 * back)
 
 
 def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, window: Any, touching: Any) -> _Step:
@@ -130,7 +152,10 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, wind
     near = (value <= tolerance) & (((rate < 0) & (zero <= width)) | ((rate == 0) & (m < 0)))
     last = jnp.where(rate < 0, jnp.minimum(jnp.minimum(value / _nonzero(-rate), zero), left), 0.0)
     hit = near | found
-    return _Step(jnp.where(hit, last, jnp.minimum(zero, width)), hit, zero >= width)
+    size = jnp.where(hit, last, jnp.minimum(zero, width))
+    back, falls = _return_to_face(system, contact, arc)
+    falls = falls & left_behind
+    return _Step(jnp.where(falls, back, size), jnp.where(falls, back <= left, hit), (zero >= width) & ~falls)
 
 
 def _nonzero(x: Any) -> Any:
@@ -185,7 +210,7 @@ def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meet
         value, rate = slope(lambda x, i=i: system.level(i, arc.time, x, arc.start), here.position, here.tangent)
         bend = system.bend(i, arc.time, Window(here.coefficients, 0.0), arc.start)
         flat = 1.0 if _is_exact(system, i, here.coefficients) else 0.0
-        returns = jnp.where(_returns(system, i, arc), 1.0, 0.0)
+        returns = jnp.where(_returns(system, i, arc, s), 1.0, 0.0)
         columns.append((value, rate, bend.low, rounding(system, i, here.size), flat, returns))
     value, rate, bend, tolerance, flat, returns = [select(contact, column) for column in zip(*columns, strict=True)]
     value, rate, bend, tolerance = shared([value, rate, bend, tolerance])
@@ -193,7 +218,8 @@ def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meet
     # On a plane a bounce of any height is computed, down to the rounding of the velocity itself.
     noise = 16.0 * float(jnp.finfo(s.dtype).eps) * norm(here.tangent)
     value = jnp.where(returns > 0.5, 0.0, value)
-    return Meeting(value, rate, rests, rests & (jnp.asarray(flat < 0.5) | (jnp.abs(rate) <= noise)))  # pyright: ignore
+    exact = jnp.asarray(flat > 0.5) | (returns > 0.5)
+    return Meeting(value, rate, rests, rests & (~exact | (jnp.abs(rate) <= noise)))  # pyright: ignore
 
 
 def newton(arc: Arc, s: Scalar, value: Number, rate: Number) -> Scalar:
@@ -207,7 +233,7 @@ def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Sc
     """The local time of a crossing found near `s`, differentiable in the arc and the system: two Newton steps, so
     that second derivatives are right too."""
     known = s = frozen(s)
-    returns = select(contact, [jnp.where(_returns(system, i, arc), 1.0, 0.0) for i in range(system.n_contacts)])
+    returns = select(contact, [jnp.where(_returns(system, i, arc, s), 1.0, 0.0) for i in range(system.n_contacts)])
     for _ in range(2):
         q, tangent = arc.position(s), arc.tangent(s)
         pairs = [

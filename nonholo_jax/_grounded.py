@@ -167,6 +167,9 @@ class Grounded(AbstractSystem):
         y = dot(across, subtract(q, middle))
         return jnp.where(present, round_level((y,), half, True), 1.0)
 
+    def face(self, contact, time, q):
+        return self.scene.face(contact, time, q) if contact < len(self.scene.surfaces) else None
+
     def reach(self, contact, q):
         return self.scene.reach(contact, q) if contact < len(self.scene.surfaces) else self.scene.ball.radius
 

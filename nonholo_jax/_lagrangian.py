@@ -303,6 +303,9 @@ class LagrangianSystem(AbstractSystem):
     def level(self, contact, time, q, state):
         return value_of(self.barriers[contact].gap, q)
 
+    def face(self, contact, time, q):
+        return None
+
     def reach(self, contact, q):
         return reach_of(self.barriers[contact].curvature)
 

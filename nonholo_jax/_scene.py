@@ -24,6 +24,7 @@ from ._vector import (
     components,
     cross,
     dot,
+    is_constant,
     plus,
     ratio,
     scale,
@@ -189,6 +190,11 @@ class Scene(AbstractSystem):
 
     def level(self, contact, time, q, state):
         return self.surfaces[contact].level(q, time, self.ball.radius)
+
+    def face(self, contact, time, q):
+        law = self.surfaces[contact].law  # elastic bounces stay high
+        elastic = is_constant(law.restitution) and law.restitution == 1
+        return None if elastic else self.surfaces[contact].face(q, time)
 
     def reach(self, contact, q):
         return self.surfaces[contact].reach(q, self.ball.radius)

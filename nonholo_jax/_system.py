@@ -79,6 +79,10 @@ class AbstractSystem(eqx.Module):
         is the one at which the arc began."""
 
     @abstractmethod
+    def face(self, contact: int, time: Scalar, q: tuple) -> Any:
+        """The flat `Face` of a surface that q is on, if low bounces on it are to be exact, else `None`."""
+
+    @abstractmethod
     def reach(self, contact: int, q: tuple) -> Number | None:
         """A length over which `bend` is worth asking for; `None` if it is as good over the whole arc."""
 

@@ -1,6 +1,7 @@
 """After the last bounce: trains against sums of single bounces, rolling against its closed forms, walls and edges."""
 
 import dataclasses
+import pathlib
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +24,12 @@ from nonholo_jax import (
     Smooth,
     Sphere,
     collide,
+    energy,
     simulate,
     simulate_batch,
 )
 from nonholo_jax._types import kind_name
+from nonholo_jax.scene_file import load_scene
 
 R, MASS, ALPHA, G = 0.1, 0.7, 0.4, 9.81
 UP, STILL = (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
@@ -162,6 +165,24 @@ def test_bounces_on_where_another_surface_is_near():
     assert kinds(b) == ["train"] and kinds(a).count("bounce") >= 2 and kinds(a)[-1] == "train"
     assert (np.asarray(a.impacts.surface[: int(a.n_impacts)]) == 0).all()
     np.testing.assert_allclose(stacked(a.final), stacked(b.final), rtol=0, atol=1e-12)
+
+
+def test_scene_of_dying_bounces():
+    """The scene file, on a box: the train's end equals the sum of its bounces, and energy never increases."""
+    file = load_scene(pathlib.Path(__file__).parent.parent / "experiments" / "scenes" / "dying_bounces.toml")
+    assert file.simulate is not None
+    options = file.simulate.arguments
+    trajectory = simulate(file.scene, file.throw, **options)
+    assert result_of(trajectory) == "reached_t1" and {"train", "rolling", "left"} <= set(kinds(trajectory))
+    options |= {"sum_trains": False, "max_impacts": 200, "throw": False}
+    each = simulate(file.scene, file.throw, **options)
+    first = kinds(trajectory).index("train")
+    np.testing.assert_allclose(float(trajectory.impacts.until[first]), float(each.t1), rtol=1e-12)
+    end = row(trajectory.impacts.after, first)
+    np.testing.assert_allclose(end.position, each.final.position, rtol=1e-12, atol=1e-13)
+    states = trajectory.at(jnp.linspace(0.0, trajectory.t1, 2001))
+    values = energy(file.scene, states)
+    assert float(jnp.max(jnp.diff(values))) <= 1e-14 * float(values[0])
 
 
 # Rolling
@@ -310,11 +331,6 @@ def course(e, tilt=0.0, radius=R, g=G, **options):
 
 
 START = BallState([-0.5, 0.0, 0.9], [2.4, 0.1, 0.0], [1.0, -2.0, 3.0])
-
-
-def energy(scene, state):
-    kinetic = jnp.sum(state.velocity**2, -1) + ALPHA * R * R * jnp.sum(state.spin**2, -1)
-    return 0.5 * MASS * kinetic + MASS * G * state.position[..., 2]
 
 
 @pytest.mark.parametrize("air", [None, Air(drag=0.4, lift=0.5)], ids=["vacuum", "air"])
