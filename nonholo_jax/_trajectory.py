@@ -16,12 +16,12 @@ from ._vector import frozen
 
 
 class ImpactLog(eqx.Module):
-    """The impacts in the order in which they happened. Every field has the leading axis log_size (behind the batch
-    axis, if any); rows that are not used hold NaN, and -1 in `surface`.
+    """The impacts in the order in which they happened, and where a ball left an edge. Every field has the leading axis
+    log_size (behind the batch axis, if any); rows that are not used hold NaN, and -1 in `surface`.
 
     - `time` in s, and `duration` in s of the arc before.
     - `until`: the time in s at which `after` holds: that of the impact, or the end of a train.
-    - `surface`: index in the order of the scene.
+    - `surface`: index in the order of the scene (of its barriers, for a `LagrangianSystem`).
     - `point` of contact in m, and unit `normal` from the surface to the ball.
     - `before`, `after`: the state on either side of the impact; the positions are equal.
     - `kind`: one of `KINDS`; `support`: index of the surface that the ball stays on afterwards, -1 if it flies.
@@ -47,7 +47,7 @@ class Trajectory(eqx.Module):
 
     - `final`: state at `t1`; after the impact if one happens there.
     - `t1`: time reached in s. Earlier than asked for if the motion ended otherwise: see `result`.
-    - `impacts`: an `ImpactLog`; `n_impacts`, how many there were (the log may hold fewer).
+    - `impacts`: an `ImpactLog`; `n_impacts`, how many rows there were (the log may hold fewer). A train is one.
     - `n_arcs`: pieces of smooth motion computed: flights with `Exact`, accepted steps with `Integrated`.
     - `result`: one of `RESULTS`.
     - `t0`, `initial`, `system`, `motion`: what the motion began with.
