@@ -5,6 +5,7 @@ Balls have a unit quaternion (w, x, y, z) for their orientation and their spin i
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -73,6 +74,13 @@ def thrown_ball(restitution: Any = 1.0, sign=1.0):
         metric=diagonal(M, M, M, J, J, J), potential=lambda q: M * G * q[2], barriers=[floor], frame=ball_frame(3),
         retraction=unit_after(3),
     )  # fmt: skip
+
+
+def floor_of_normals(restitution: Any = 1.0):
+    """The thrown ball at a floor that holds only the normal velocity: specular reflection, and as a question put to a
+    motion of `thrown_ball`, test functions outside of its ker B."""
+    floor = Barrier(lambda q: q[2] - R, constant([[0, 0, 1.0, 0, 0, 0]]), restitution, curvature=0.0)
+    return eqx.tree_at(lambda system: system.barriers, thrown_ball(), (floor,))
 
 
 ROLLING = [[1.0, 0, 0, -R, 0], [0, 1.0, R, 0, 0]]
