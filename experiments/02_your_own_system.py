@@ -46,12 +46,12 @@ def checks() -> list[Check]:
     system, trajectory = cart(0.8), roll(heading)
     log, n = trajectory.impacts, int(trajectory.n_impacts)
     q, v = trajectory.final
-    slope = jax.grad(lambda heading: roll(heading).final[0][0])(heading)
-    central = (roll(heading + h).final[0][0] - roll(heading - h).final[0][0]) / (2 * h)
+    slope = jax.grad(lambda heading: roll(heading).final[0][1])(heading)
+    central = (roll(heading + h).final[0][1] - roll(heading - h).final[0][1]) / (2 * h)
     before, after = (jax.vmap(system.energy)(*state) for state in (log.before, log.after))
     arcs = jnp.append(before[:n], energy(system, (q, v))) - jnp.append(system.energy(*trajectory.initial), after[:n])
     print(f"{n} impacts at t = {log.time[:n]} s; energy {before[:n]} J before, {after[:n]} J after")
-    print(f"x(6 s) = {float(q[0]):.6f} m, d x(6 s) / d heading = {float(slope):.6f} m/rad, through {n} impacts\n")
+    print(f"y(6 s) = {float(q[1]):.6f} m, d y(6 s) / d heading = {float(slope):.6f} m/rad, through {n} impacts\n")
     slip = jnp.max(jnp.abs(system.constraint(q) @ v)) / jnp.max(jnp.abs(v))
     return [
         Check("energy between impacts, change", float(jnp.max(jnp.abs(arcs))), 1e-9, unit="J"),
