@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import diffrax
 import jax
 
+from nonholo_jax import law_residual, weak_residual
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -30,6 +32,14 @@ class Check(NamedTuple):
     def passes(self) -> bool:
         """A NaN does not."""
         return self.value > self.bound if self.above else self.value <= self.bound
+
+
+def residuals(system, trajectory) -> list[Check]:
+    """The paper's definition (2.4), and its law (6.1), asked of a motion of a LagrangianSystem."""
+    return [
+        Check("weak_residual, (2.4)", float(weak_residual(system, trajectory)), 1e-9),
+        Check("law_residual, (6.1)", float(law_residual(system, trajectory)), 1e-12),
+    ]
 
 
 def machine() -> str:
