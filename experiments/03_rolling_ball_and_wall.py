@@ -83,13 +83,18 @@ def picture() -> None:
     times = jnp.linspace(0.0, 1.35, 200)
     for spin, colour in zip((-30.0, -15.0, 0.0, 15.0, 30.0), (VERMILION, ORANGE, INK, GREEN, BLUE), strict=True):
         path = np.asarray(simulate(room(), rolling(V1, V2, spin), t1=1.4).at(times).position)
-        left.plot(path[:, 0], path[:, 1], color=colour, lw=1.4)
-        left.annotate(f"{spin:+.0f}" if spin else "0", path[-1, :2], xytext=(4, 0), textcoords="offset points",
-                      color=colour, fontsize=8, va="center")  # fmt: skip
+        out = path[np.argmin(path[:, 0]) :]
+        left.plot(out[:, 0], out[:, 1], color=colour, lw=1.4)
+        label = f"{spin:+.0f}".replace("-", "\N{MINUS SIGN}").replace("+0", "0")
+        left.annotate(label, path[-1, :2], xytext=(4, 0), textcoords="offset points", color=colour, fontsize=8,
+                      va="center")  # fmt: skip
+    left.annotate(
+        "", (0.11, V2 * (START - R) / -V1), (1.0, 0.0), arrowprops={"arrowstyle": "-|>", "color": PURPLE, "lw": 1.8}
+    )
     left.axvspan(-0.12, 0.0, color=FAINT, alpha=0.4, lw=0)
     left.axvline(R, color=FAINT, lw=0.8, ls=":")
-    left.text(-0.06, -0.6, "wall", rotation=90, ha="center", va="center", fontsize=8)
-    left.text(0.62, -0.02, "in", fontsize=8, ha="center")
+    left.text(-0.06, 1.2, "wall", rotation=90, ha="center", va="center", fontsize=8)
+    left.text(1.02, 0.0, "in", fontsize=8, color=PURPLE, va="center")
     left.set(xlim=(-0.12, 1.25), aspect="equal")
     left.set_xlabel("x of the centre (m)", fontsize=9)
     left.set_ylabel("y of the centre (m)", fontsize=9)
