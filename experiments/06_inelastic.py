@@ -79,7 +79,7 @@ def picture() -> None:
     new, (left, right) = figure(7.2, 3.1, 1, 2, width_ratios=[1.25, 1])
     times = jnp.linspace(0.0, 0.9, 400)
     for mu, colour in zip((0.0, 0.25, 0.5, 0.75, 1.0), COLOURS, strict=True):
-        start = BallState([-0.5, 0.25, R + 0.3], VELOCITY, SPIN)
+        start = BallState([-0.5, 0.25, R + 0.3], VELOCITY, [3.0, 10.0, 5.0])
         path = np.asarray(simulate(scene(mu), start, t1=0.9, max_impacts=64).at(times).position)
         left.plot(path[:, 0], path[:, 2], color=colour, lw=1.3, label=f"{mu:g}")
     left.axhspan(-0.03, 0.0, color=FAINT, alpha=0.4, lw=0)

@@ -128,7 +128,8 @@ def picture() -> None:
     left.loglog(STIFFNESS[:5], 30 / STIFFNESS[:5], color=INK, lw=0.8, ls="--", label=r"$k^{-1}$")
     left.set_xlabel(r"stiffness $k$ (s$^{-2}$)", fontsize=9)
     left.set_ylabel(r"$|v - v^+| \,/\, |v^-|$", fontsize=9)
-    left.legend(fontsize=7, frameon=False)
+    left.set_ylim(1e-12, 1e6)
+    left.legend(fontsize=6.5, frameon=False, loc="upper right", ncols=2)
     rough, times = CASES[2], jnp.linspace(0.0, np.pi, 100)
     for k, style in ((1e2, ":"), (1e3, "--"), (1e6, "-")):
         v = np.asarray(contact(rough, k**-0.5, times=times))
