@@ -100,7 +100,8 @@ def test_exact_agrees_with_integrated(name, getkey):
     throw = sampler(generator(getkey()))
     scene = Scene(Ball(R, 0.7), surfaces(), GRAVITY)
     exact, integrated = (
-        simulate_batch(scene, throw, t1=t1, max_impacts=24, motion=motion) for motion in (Exact(), FINE)
+        simulate_batch(scene, throw, t1=t1, max_impacts=24, sum_trains=False, motion=motion)
+        for motion in (Exact(), FINE)
     )
     fine = np.array(results_of(exact)) == "reached_t1"
     assert fine.sum() > 0.99 * N  # a ball that is thrown so slowly that its bounces end is left to other tests
@@ -159,7 +160,7 @@ def test_errors_fall_with_the_tolerance(name, getkey):
     @jax.jit
     def run(tolerance):
         motion = Integrated(stepsize_controller=diffrax.PIDController(tolerance, tolerance), max_steps=2048)
-        end = simulate_batch(scene, throw, t1=1.0, max_impacts=16, motion=motion)
+        end = simulate_batch(scene, throw, t1=1.0, max_impacts=16, sum_trains=False, motion=motion)
         return end.final.position, end.impacts.surface, end.result, end.n_impacts
 
     names = lambda result: np.array([result_name(lane(result, i)) for i in range(len(throw.position))])  # noqa: E731
@@ -193,7 +194,7 @@ def air_bounce(solver, h):
     scene = Scene(Ball(R, LIGHT), {"floor": floor(Rough(0.8))}, GRAVITY, Air(**AIR))
     motion = Integrated(solver=solver, stepsize_controller=diffrax.ConstantStepSize(), dt0=h, max_steps=2048)
     throw = BallState([0, 0, 0.6], [6.0, 1.0, -3.0], [5.0, 150.0, -100.0])
-    return simulate(scene, throw, t1=0.5, max_impacts=1, motion=motion, throw=False)
+    return simulate(scene, throw, t1=0.5, max_impacts=1, sum_trains=False, motion=motion, throw=False)
 
 
 @pytest.fixture(scope="module")
@@ -309,7 +310,9 @@ def test_planar_motion_stays_planar(motion, getkey):
     position = np.c_[rng.uniform(-1.5, 1.2, n), zero, rng.uniform(1.0, 1.5, n)]
     velocity = np.c_[rng.normal(0, 2, n), zero, rng.normal(0, 2, n)]
     spin = np.c_[zero, rng.normal(0, 30, n), zero]
-    end = simulate_batch(scene, states(position, velocity, spin), t1=1.0, max_impacts=32, motion=motion)
+    end = simulate_batch(
+        scene, states(position, velocity, spin), t1=1.0, max_impacts=32, sum_trains=False, motion=motion
+    )
     assert np.asarray(end.n_impacts).mean() > 1
     off_plane = [end.final.position[:, 1], end.final.velocity[:, 1], end.final.spin[:, 0], end.final.spin[:, 2]]
     assert all(np.all(np.asarray(x) == 0.0) for x in off_plane)
@@ -321,12 +324,16 @@ def test_at_is_the_motion(motion, getkey):
     rng, t0, t1 = generator(getkey()), 0.25, 1.25
     scene = Scene(Ball(R, 0.7), room(Rough(0.9)), GRAVITY, None if isinstance(motion, Exact) else Air())
     throw = random_states(rng, 8, -0.85, 0.85, 3.0)
-    whole = simulate_batch(scene, throw, t0=t0, t1=t1, max_impacts=16, motion=motion)
+    whole = simulate_batch(scene, throw, t0=t0, t1=t1, max_impacts=16, sum_trains=False, motion=motion)
     times = np.linspace(t0, t1, 11)
     found = stacked(whole.at(times))
     assert found.shape == (8, 11, 9)
     tolerance = 1e-11 if isinstance(motion, Exact) else 1e-6  # air: the steps are others, to the tolerance
-    to = jax.jit(lambda t: stacked(simulate_batch(scene, throw, t0=t0, t1=t, max_impacts=16, motion=motion).final))
+    to = jax.jit(
+        lambda t: stacked(
+            simulate_batch(scene, throw, t0=t0, t1=t, max_impacts=16, sum_trains=False, motion=motion).final
+        )
+    )
     for i, t in enumerate(times):
         np.testing.assert_allclose(found[:, i], to(jnp.asarray(t)), rtol=0, atol=tolerance * 10)
     np.testing.assert_allclose(found[:, 0], stacked(throw), rtol=0, atol=0)
