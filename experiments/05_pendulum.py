@@ -83,7 +83,7 @@ def picture(bounces: int = 1000, fewer: int = 100) -> None:
     left.set(aspect="equal", ylim=(-0.02, 0.28))
     left.set_xlabel("x of the centre (m)", fontsize=9)
     left.set_ylabel("z of the centre (m)", fontsize=9)
-    left.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.3), ncols=2)
+    left.legend(fontsize=8, frameon=False, loc="upper center", ncols=2)
     for trajectory, colour, label in ((many, BLUE, "ball engine"), (few, INK, "Lagrangian system, 1e-12")):
         error = np.maximum(strayed(trajectory), 1e-17)
         right.loglog(np.arange(1, error.size + 1), error, color=colour, lw=1.2, label=label)

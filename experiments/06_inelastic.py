@@ -81,12 +81,12 @@ def picture() -> None:
     for mu, colour in zip((0.0, 0.25, 0.5, 0.75, 1.0), COLOURS, strict=True):
         start = BallState([-0.5, 0.25, R + 0.3], VELOCITY, [3.0, 10.0, 5.0])
         path = np.asarray(simulate(scene(mu), start, t1=0.9, max_impacts=64).at(times).position)
-        left.plot(path[:, 0], path[:, 2], color=colour, lw=1.3, label=f"{mu:g}")
+        left.plot(path[:, 0], path[:, 2], color=colour, lw=1.3, label=rf"$\mu$ = {mu:g}")
     left.axhspan(-0.03, 0.0, color=FAINT, alpha=0.4, lw=0)
     left.axhline(R, color=FAINT, lw=0.8, ls=":")
     left.set_xlabel("x of the centre (m)", fontsize=9)
     left.set_ylabel("z of the centre (m)", fontsize=9)
-    left.legend(title=r"$\mu$", title_fontsize=8, fontsize=8, frameon=False)
+    left.legend(fontsize=8, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5, columnspacing=1.0)
     mu = np.linspace(0.0, 1.0, 11)
     log = simulate_batch(
         jax.vmap(scene)(jnp.asarray(mu)), throw(11), t1=1.0, scene_axes=0, max_impacts=1, sum_trains=False

@@ -121,15 +121,14 @@ def checks(cases=CASES, stiffness: np.ndarray = STIFFNESS) -> list[Check]:
 
 
 def picture() -> None:
-    new, (left, right) = figure(7.2, 3.1, 1, 2)
+    new, (left, right) = figure(7.2, 3.5, 1, 2)
     for case, colour, mark in zip(CASES, (ORANGE, GREEN, BLUE, VERMILION), "os^D", strict=True):
         left.loglog(STIFFNESS, errors(case, STIFFNESS)[0], mark + "-", ms=3.5, lw=1.0, color=colour, label=case.name)
     left.loglog(STIFFNESS, 30 * STIFFNESS**-0.5, color=INK, lw=0.8, ls=":", label=r"$k^{-1/2}$")
     left.loglog(STIFFNESS[:5], 30 / STIFFNESS[:5], color=INK, lw=0.8, ls="--", label=r"$k^{-1}$")
     left.set_xlabel(r"stiffness $k$ (s$^{-2}$)", fontsize=9)
     left.set_ylabel(r"$|v - v^+| \,/\, |v^-|$", fontsize=9)
-    left.set_ylim(1e-12, 1e6)
-    left.legend(fontsize=6.5, frameon=False, loc="upper right", ncols=2)
+    new.legend(handles=left.get_lines(), fontsize=7, frameon=False, loc="outside upper left", ncols=3)
     rough, times = CASES[2], jnp.linspace(0.0, np.pi, 100)
     for k, style in ((1e2, ":"), (1e3, "--"), (1e6, "-")):
         v = np.asarray(contact(rough, k**-0.5, times=times))

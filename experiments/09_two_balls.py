@@ -92,7 +92,7 @@ def picture() -> None:
     left.set(aspect="equal")
     left.set_xlabel("x (m)", fontsize=9)
     left.set_ylabel("y (m)", fontsize=9)
-    left.legend(fontsize=7.5, frameon=False, ncols=2, loc="upper center", bbox_to_anchor=(0.45, 1.5))
+    left.legend(fontsize=7.5, frameon=False, ncols=4, loc="lower left", bbox_to_anchor=(-0.1, 1.0), columnspacing=1.0)
     shares = {
         "total": (np.asarray(jax.vmap(system.energy)(jnp.asarray(q), jnp.asarray(v))), INK),
         "first ball": (0.5 * M * np.sum(v[:, :3] ** 2, 1) + 0.5 * J * np.sum(v[:, 3:6] ** 2, 1), BLUE),

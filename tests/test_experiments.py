@@ -29,7 +29,7 @@ SMALL = {
     "04": lambda: script("04").checks(t1=1.2, with_errors=False),
     "05": lambda: script("05").checks(bounces=100, fewer=5),
     "06": lambda: script("06").checks(n=5),
-    "07": lambda: script("07").checks(script("07").CASES[3:], 10.0 ** np.arange(4, 9)),
+    "07": lambda: script("07").checks(script("07").CASES[3:], 10.0 ** np.arange(8, 13)),
     "08": lambda: script("08").checks(("turntable",), steps=2000, step_sizes=0.2 / 2 ** np.arange(4)),
     "09": lambda: script("09").checks((2.5,), (0.6,)),
 }
