@@ -447,7 +447,7 @@ def test_nearly_at_one_instant_resolves_in_order():
     floor = Plane(STILL, UP, Rough(0.8))
     side = Plane(STILL, (1.0, 0.0, 0.0), Rough(0.9))
     offsets = jnp.concatenate([jnp.array([0.0]), 10.0 ** jnp.arange(-16.0, -1.0)])
-    position = jnp.array([0.6, 0.0, 0.6]) + offsets[:, None] * jnp.array([1.0, 0.0, 0.0])
+    position = jnp.array([[0.6, 0.0, 0.6]]) + offsets[:, None] * jnp.array([[1.0, 0.0, 0.0]])
     states = BallState(position, jnp.tile(jnp.array([-1.0, 0.3, -1.0]), (16, 1)), jnp.ones((16, 3)))
     for law in (floor.law, side.law):
         scene = Scene(BALL, {"floor": floor, "wall": Plane(STILL, (1.0, 0.0, 0.0), law)}, gravity=STILL)
