@@ -15,7 +15,7 @@ import numpy as np
 from ._outline import View, as_numpy, axis_name, half_plane, room, views
 from ._samples import Samples, Strikes, end_of, energies, sample
 from ._scene import Scene
-from ._types import is_success, result_name
+from ._types import result_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -392,7 +392,7 @@ def _title(scene: Scene, trajectory: Any, strikes: Strikes, end: float, title: s
         shown = ", ".join(words[:5]) + (", \N{HORIZONTAL ELLIPSIS}" if len(words) > 5 else "")
         n = len(names) - strikes.kind.count("left")
         title = f"{n} impact{'s' * (n != 1)}{': ' * bool(names)}{shown}"
-    if end >= float(trajectory.t1) and not bool(is_success(trajectory.result)):
+    if end >= float(trajectory.t1) and result_name(trajectory.result) != "reached_t1":
         title += f" \N{EN DASH} ended at {end:.4g} s: {result_name(trajectory.result)}"
     return title
 

@@ -256,9 +256,11 @@ def test_until_ends_the_picture():
 
 def test_a_motion_that_ended_early_says_so():
     scene = Scene(Ball(0.05, 0.1), {"floor": Plane((0, 0, 0), (0, 0, 1), Rough(0.5))})
-    trajectory = simulate(scene, BallState([0, 0, 1], [0, 0, 0], [0, 0, 0]), t1=5.0, throw=False)
-    assert "sustained_contact" in plot_trajectory(scene, trajectory).get_suptitle()
-    assert "sustained_contact" not in plot_trajectory(scene, trajectory, until=0.5).get_suptitle()
+    for name, sum_trains in (("at_rest", True), ("sustained_contact", False)):
+        options = {"sum_trains": sum_trains, "throw": False}
+        trajectory = simulate(scene, BallState([0, 0, 1], [0, 0, 0], [0, 0, 0]), t1=5.0, **options)
+        assert name in plot_trajectory(scene, trajectory).get_suptitle()
+        assert name not in plot_trajectory(scene, trajectory, until=0.5).get_suptitle()
     _, _, figure = _drawn("table", title="Under the table")
     assert figure.get_suptitle() == "Under the table"
 
