@@ -10,12 +10,14 @@ from ._ball import Ball
 from ._impact import _dot
 from ._law import AbstractContactLaw
 from ._types import Number, Vector3
-from ._vector import components, root
+from ._vector import components, is_constant, root
 
 
 def is_one_mu(law: AbstractContactLaw) -> bool:
     """Whether a law is the paper's: one mu multiplies all that the wall constrains."""
-    return law.rolls is False or (law.rolls is True and law.reversal() is law.restitution)
+    e_n, e_t = law.restitution, law.reversal()
+    same = e_t is e_n or (is_constant(e_n) and is_constant(e_t) and e_n == e_t)
+    return law.rolls is False or (law.rolls is True and same)
 
 
 def _rows(law: AbstractContactLaw, n: Any) -> Any:
