@@ -16,7 +16,7 @@ from ._vector import components, is_constant, root
 def is_one_mu(law: AbstractContactLaw) -> bool:
     """Whether a law is the paper's: one mu multiplies all that the wall constrains."""
     e_n, e_t = law.restitution, law.reversal()
-    same = e_t is e_n or (is_constant(e_n) and is_constant(e_t) and e_n == e_t)
+    same = e_t is e_n or (is_constant(e_n) and is_constant(e_t) and bool(e_n == e_t))
     return law.rolls is False or (law.rolls is True and same)
 
 
