@@ -17,7 +17,8 @@ def is_one_mu(law: AbstractContactLaw) -> bool:
     """Whether a law is the paper's: one mu multiplies all that the wall constrains."""
     e_n, e_t = law.restitution, law.reversal()
     same = e_t is e_n or (is_constant(e_n) and is_constant(e_t) and bool(e_n == e_t))
-    return law.rolls is False or (law.rolls is True and same)
+    rough = law.rolls is True and law.sliding_friction() is None
+    return law.rolls is False or (rough and same)
 
 
 def _rows(law: AbstractContactLaw, n: Any) -> Any:

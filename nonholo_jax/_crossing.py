@@ -91,13 +91,13 @@ def _return_to_face(system: AbstractSystem, contact: int, arc: Arc) -> tuple[Sca
     face = system.face(contact, arc.time, q) if all(len(p) <= 3 for p in arc.configuration) else None
     if face is None:
         return jnp.asarray(jnp.inf, dtype=arc.time.dtype), jnp.asarray(False)
-    n = face.normal
-    rise = dot(n, tuple(p[1] if len(p) > 1 else 0.0 for p in arc.configuration))
-    pull = -dot(n, tuple(p[2] if len(p) > 2 else 0.0 for p in arc.configuration))
+    n, place = face.normal, arc.configuration[:3]
+    rise = dot(n, tuple(p[1] if len(p) > 1 else 0.0 for p in place))
+    pull = -dot(n, tuple(p[2] if len(p) > 2 else 0.0 for p in place))
     falls = jnp.asarray((pull > 0) & (rise > 0) & face.below)
     s = jnp.where(falls, rise / jnp.where(falls, pull, 1.0), jnp.inf)
     if face.half is not None:
-        landing = subtract(arc.position(jnp.where(falls, s, 0.0)), face.center)
+        landing = subtract(arc.position(jnp.where(falls, s, 0.0))[:3], face.center)
         for across, half in zip(face.tangents, face.half, strict=True):
             falls = falls & (abs(dot(across, landing)) <= half)
     return s, falls

@@ -6,9 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.core
 import jax.numpy as jnp
 
-from . import _train as train
+from . import _rolling as rolling, _train as train
 from ._rotation import rolled
 from ._round import round_bend, round_level
 from ._scene import Flight, Scene
@@ -18,12 +20,10 @@ from ._types import KINDS, RESULTS, Number, Vector3
 from ._vector import (
     add,
     components,
-    cross,
     dot,
     is_constant,
     minimum,
     norm,
-    plus,
     ratio,
     scale,
     select,
@@ -34,12 +34,21 @@ from ._vector import (
 )
 
 
+class Ground(NamedTuple):
+    """What a ball on a face has below it."""
+
+    face: Face
+    edged: Any  # whether the face has edges
+    slip: Vector3  # zero of a ball that rolls, and where there is no friction to slide against
+    heading: Vector3  # the direction in which it slides against friction, or zero
+
+
 class Travel(NamedTuple):
     """A ball's state inside the engine, with the phase that it is in."""
 
     flight: Flight
     support: Any  # index of the surface that the ball stays on, -1 in flight; a float, as all of a state is
-    below: Any = None  # the face that it is on, and whether that has edges; only while an arc is worked on
+    below: Ground | None = None  # only while an arc is worked on
 
 
 def _can_settle(surface: AbstractSurface) -> bool:
@@ -54,16 +63,18 @@ def _where(condition: Any, a: Sequence[Number], b: Sequence[Number]) -> Any:
 
 
 class Grounded(AbstractSystem):
-    """A scene with the motion after the last bounce. `tolerance` is the velocity in m/s that air may change during a
-    train that is summed."""
+    """A scene with the motion after the last bounce. `tolerance` is the velocity in m/s that what has no sum may change
+    during a train that is summed; `parabolic` says that arcs must be parabolas. Where a surface has a coefficient of
+    friction, the slip is part of the configuration, and its end is a contact."""
 
     scene: Scene
     tolerance: float = eqx.field(static=True)
+    parabolic: bool = eqx.field(static=True)
     hits: bool = eqx.field(static=True)
     is_long: ClassVar[bool] = False
 
-    def __init__(self, scene: Scene, tolerance: float = 0.0, hits: bool = True):
-        self.scene, self.tolerance, self.hits = scene, tolerance, hits
+    def __init__(self, scene: Scene, tolerance: float = 0.0, parabolic: bool = False, hits: bool = True):
+        self.scene, self.tolerance, self.parabolic, self.hits = scene, tolerance, parabolic, hits
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -74,10 +85,20 @@ class Grounded(AbstractSystem):
         return [i for i, surface in enumerate(self.scene.surfaces) if _can_settle(surface)]
 
     @property
-    def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The surfaces, and, where some of them have faces with edges, the two pairs of edges of the face below."""
+    def _slips(self) -> bool:
+        """Whether a ball may slide against friction, so that its slip is followed."""
+        return any(self.scene.surfaces[i].law.sliding_friction() is not None for i in self._floors)
+
+    @property
+    def _end_of_slip(self) -> int:
+        """The contact at which a slip has died out, behind the surfaces and, where some of them have faces with edges,
+        the two pairs of edges of the face below."""
         edges = any(face.half is not None for face in self._faces((0.0, 0.0, 0.0), 0.0))
-        return (len(self.scene.surfaces) + 2 * edges) if self.hits else 0
+        return len(self.scene.surfaces) + 2 * edges
+
+    @property
+    def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return (self._end_of_slip + self._slips) if self.hits else 0
 
     def _faces(self, x: Vector3, time: Any) -> list[Face]:
         faces = [self.scene.surfaces[i].face(x, time) for i in self._floors]
@@ -99,41 +120,76 @@ class Grounded(AbstractSystem):
         return face, pick([0.0 if each.half is None else 1.0 for each in faces])
 
     def _rolls(self, index: Any) -> Any:
-        flags = [1.0 if self.scene.surfaces[i].law.rolls else 0.0 for i in self._floors]
+        """Whether a ball rolls on the surface of that index, perhaps after sliding."""
+        laws = [self.scene.surfaces[i].law for i in self._floors]
+        frictions = [law.sliding_friction() for law in laws]
+        flags = [(1.0 if law.rolls else 0.0) if f is None else jnp.where(jnp.asarray(f) > 0, 1.0, 0.0)
+                 for law, f in zip(laws, frictions, strict=True)]  # fmt: skip
         return jnp.asarray(_pick(index, self._floors, flags)) > 0.5
+
+    def _friction(self, index: Any) -> Number:
+        """The coefficient on the surface of that index; infinite where a ball never slides or never rolls."""
+        frictions = [self.scene.surfaces[i].law.sliding_friction() for i in self._floors]
+        return _pick(index, self._floors, [jnp.inf if f is None else f for f in frictions])
 
     # Smooth motion
 
     def evolving(self, state: Travel):
-        return self.scene.evolving(state.flight)
+        position, velocity = self.scene.evolving(state.flight)
+        if not self._slips:
+            return position, velocity
+        return (*position, *(rolling.NONE if state.below is None else state.below.slip)), velocity
 
     def is_uniform(self):
         return self.scene.is_uniform()
 
-    def _rolling_spin(self, normal: Vector3, velocity: Vector3, spin: Vector3) -> Vector3:
-        """The spin without slip: (1.1) solved for the part along the surface. The part about the normal stays."""
-        return add(scale(ratio(1.0, self.scene.ball.radius), cross(normal, velocity)), scale(dot(normal, spin), normal))
-
     def prepared(self, time, state):
-        return state._replace(below=self._face(state.support, state.flight.position, time))
+        return state._replace(below=self._ground(time, state))
+
+    def _ground(self, time: Any, state: Travel) -> Ground:
+        flight = state.flight
+        face, edged = self._face(state.support, flight.position, time)
+        if not self._slips:
+            return Ground(face, edged, rolling.NONE, rolling.NONE)
+        ball, n, friction = self.scene.ball, face.normal, self._friction(state.support)
+        slides = (state.support >= 0) & self._rolls(state.support) & jnp.isfinite(friction)
+        slip = rolling.own_slip(ball, n, flight.velocity, flight.spin)
+        slip = _where(slides, slip, rolling.NONE)
+        a = self._pull(time, flight)
+        most = jnp.where(slides, friction, 0.0) * -dot(a, n) * (1.0 + 1.0 / ball.inertia_ratio)
+        return Ground(
+            face, edged, slip, _where(slides, rolling.heading(slip, rolling.along_surface(n, a), most), rolling.NONE)
+        )
 
     def derivative(self, time, state, q, v):
         flight, on = state.flight, state.support >= 0
-        face, _ = self._below(time, state)
-        rolls = on & self._rolls(state.support)
+        below, ball = self._below(time, state), self.scene.ball
+        n, rolls = below.face.normal, on & self._rolls(state.support)
+        q, slip = q[:3], q[3:]
         if self.scene.air is not None:
-            spin = self._rolling_spin(face.normal, v, flight.spin)
-            flight = flight._replace(spin=_where(rolls, spin, flight.spin))
+            turning = subtract(v, slip) if slip else v
+            flight = flight._replace(
+                spin=_where(rolls, rolling.rolling_spin(ball, n, turning, flight.spin), flight.spin)
+            )
         _, a = self.scene.derivative(time, flight, q, v)
-        along = subtract(a, scale(dot(a, face.normal), face.normal))
-        share = jnp.where(rolls, 1.0 / (1.0 + self.scene.ball.inertia_ratio), 1.0)  # what the spin does not take
-        return v, _where(on, scale(share, along), a)
+        along = rolling.along_surface(n, a)
+        taken = 1.0 / (1.0 + ball.inertia_ratio)  # what the spin does not take
+        if not slip:
+            return v, _where(on, scale(jnp.where(rolls, taken, 1.0), along), a)
+        slides = dot(below.heading, below.heading) > 0
+        friction = jnp.where(slides, self._friction(state.support), 0.0) * dot(a, n)
+        kick = scale(friction, rolling.later_heading(slip, below.heading))
+        share = jnp.where(rolls & ~slides, taken, 1.0)
+        changes = add(along, scale(1.0 + 1.0 / ball.inertia_ratio, kick))
+        return (*v, *_where(slides, changes, rolling.NONE)), _where(on, add(scale(share, along), kick), a)
 
     def advanced(self, time, state, q, v, duration):
         rolls = (state.support >= 0) & self._rolls(state.support)
-        flight = self.scene.advanced(time, state.flight, q, v, duration)
-        face, _ = self._below(time, state)
-        before, after = (self._rolling_spin(face.normal, u, flight.spin) for u in (state.flight.velocity, v))
+        flight = self.scene.advanced(time, state.flight, q[:3], v, duration)
+        below, ball = self._below(time, state), self.scene.ball
+        slips = (below.slip, q[3:] if self._slips else rolling.NONE)
+        before, after = (rolling.rolling_spin(ball, below.face.normal, subtract(u, slip), flight.spin)
+                         for u, slip in zip((state.flight.velocity, v), slips, strict=True))  # fmt: skip
         orientation = flight.orientation
         if orientation is not None:
             orientation = jnp.where(
@@ -150,35 +206,46 @@ class Grounded(AbstractSystem):
     def named(self, contact, state):
         return jnp.where(contact >= len(self.scene.surfaces), self.phase(state), contact)
 
-    def _below(self, time: Any, state: Travel) -> tuple[Face, Any]:
-        return self._face(state.support, state.flight.position, time) if state.below is None else state.below
+    def _below(self, time: Any, state: Travel) -> Ground:
+        return self._ground(time, state) if state.below is None else state.below
 
     def _exit(self, contact: int, state: Travel, time: Any) -> tuple[Vector3, Vector3, Number, Any]:
         """Along one pair of edges: across, middle, half size, and whether there are such edges."""
-        face, edged = self._below(time, state)
+        face, edged, *_ = self._below(time, state)
         assert face.half is not None
         k = contact - len(self.scene.surfaces)
         return face.tangents[k], face.center, face.half[k], (state.support >= 0) & (edged > 0)
 
     def level(self, contact, time, q, state):
+        x = q[:3]
         if contact < len(self.scene.surfaces):
-            return jnp.where(state.support == contact, 1.0, self.scene.level(contact, time, q, state.flight))
+            return jnp.where(state.support == contact, 1.0, self.scene.level(contact, time, x, state.flight))
+        if contact == self._end_of_slip:
+            heading = self._below(time, state).heading
+            return jnp.where(dot(heading, heading) > 0, dot(heading, q[3:]), 1.0)
         across, middle, half, present = self._exit(contact, state, time)
-        y = dot(across, subtract(q, middle))
+        y = dot(across, subtract(x, middle))
         return jnp.where(present, round_level((y,), half, True), 1.0)
 
     def face(self, contact, time, q):
-        return self.scene.face(contact, time, q) if contact < len(self.scene.surfaces) else None
+        return self.scene.face(contact, time, q[:3]) if contact < len(self.scene.surfaces) else None
 
     def reach(self, contact, q):
-        return self.scene.reach(contact, q) if contact < len(self.scene.surfaces) else self.scene.ball.radius
+        if contact == self._end_of_slip:
+            return None
+        return self.scene.reach(contact, q[:3]) if contact < len(self.scene.surfaces) else self.scene.ball.radius
 
     def bend(self, contact, time, window, state):
+        place = window._replace(coefficients=window.coefficients[:3])
         if contact < len(self.scene.surfaces):
-            bend, skip = self.scene.bend(contact, time, window, state.flight), state.support == contact
+            bend, skip = self.scene.bend(contact, time, place, state.flight), state.support == contact
+        elif contact == self._end_of_slip:
+            heading = self._below(time, state).heading
+            bend = window._replace(coefficients=window.coefficients[3:]).along(heading, rolling.NONE).bend
+            skip = dot(heading, heading) == 0
         else:
             across, middle, half, present = self._exit(contact, state, time)
-            bend, skip = round_bend(window, (across,), middle, half, True), ~present
+            bend, skip = round_bend(place, (across,), middle, half, True), ~present
         low, high = (jnp.where(skip, 0.0, x) for x in bend)
         return type(bend)(low, high)
 
@@ -203,16 +270,32 @@ class Grounded(AbstractSystem):
         _, a = self.scene.derivative(time, flight, flight.position, flight.velocity)
         return a
 
-    def _laws(self, contact: Any) -> tuple[Number, Number]:
-        """e_n and e_t of the surface of that index, if it is one to settle on."""
-        laws = [self.scene.surfaces[i].law for i in self._floors]
+    def _law(self, contact: Any) -> train.Contact:
+        """What trains need of the surface of that index, if it is one to settle on."""
+        laws, ball = [self.scene.surfaces[i].law for i in self._floors], self.scene.ball
         reversals: list = [law.reversal() for law in laws]
-        return _pick(contact, self._floors, [law.restitution for law in laws]), _pick(contact, self._floors, reversals)
+        return train.Contact(
+            _pick(contact, self._floors, [law.restitution for law in laws]),
+            _pick(contact, self._floors, reversals),
+            self._friction(contact) if self._slips else None,
+            self._rolls(contact),
+            ball.inertia_ratio,
+            ball.radius,
+        )
+
+    def _regime(self, contact: Any, first: train.Start) -> tuple[Any, Any]:
+        """Whether all impacts of a train slip, and whether all of them grip."""
+        law = self._law(contact)
+        if law.friction is None:
+            return jnp.asarray(False), jnp.asarray(True)
+        limited = law.rolls & jnp.isfinite(law.friction)
+        tolerance = jnp.inf if self.parabolic else self.tolerance  # a path that bends has a name of its own
+        slips = limited & train.slips_throughout(first, law, tolerance)
+        return slips, ~limited | (train.grips_throughout(first, law) & ~slips)
 
     def _summed(self, contact: Any, first: train.Start) -> train.End:
-        restitution, reversal = self._laws(contact)
-        ball = self.scene.ball
-        return train.summed(first, restitution, reversal, ball.inertia_ratio, ball.radius, self._rolls(contact))
+        slips, _ = self._regime(contact, first)
+        return train.summed(first, self._law(contact), slips)
 
     def _room(self, contact: Any, x: Vector3, time: Any, face: Face, edged: Any) -> Number:
         """How far the centre can go from a place on a surface without meeting another, or the face's edge."""
@@ -229,8 +312,7 @@ class Grounded(AbstractSystem):
     def _sums(self, contact: Any, time: Any, struck: Flight, first: train.Start, floor: tuple) -> tuple[Any, Any]:
         """How long the train lasts, and whether it can be summed: no other surface nor an edge can be reached before it
         ends, and air changes nothing."""
-        restitution, _ = self._laws(contact)
-        lasts = train.duration(first, restitution)
+        lasts = train.duration(first, self._law(contact).restitution)
         lasts_known = jnp.where(jnp.isfinite(lasts), lasts, 0.0)
         height = ratio(first.rise * first.rise, 2.0 * first.pull)
         clear = train.span(first, lasts_known) + height < self._room(contact, struck.position, time, *floor)
@@ -241,16 +323,17 @@ class Grounded(AbstractSystem):
             calm = norm(subtract(self._pull(time, struck), later)) * lasts_known <= self.tolerance
         if struck.orientation is not None:  # infinitely many rotations have no sum
             calm = jnp.asarray(False)
-        return lasts, clear & calm
+        slips, grips = self._regime(contact, first)
+        return lasts, clear & calm & (slips | grips)
 
     def _stays(self, contact: Any, support: Any) -> Any:
         """Whether a ball on `support` stays on it when it hits a surface: Theorem 5.1 needs one common mu there, and a
         smooth wall turns the ball round."""
-        rolls = self._rolls(support)
+        rolls = self._rolls(support) & ~jnp.isfinite(self._friction(support))
         stays = []
         for surface in self.scene.surfaces:
             law = surface.law
-            common = law.rolls and law.reversal() == law.restitution
+            common = law.rolls and law.sliding_friction() is None and law.reversal() == law.restitution
             stays.append(jnp.where(rolls & jnp.asarray(common), 1.0, 0.0) if law.rolls else float(law.rolls is False))
         return jnp.asarray(select(contact, stays)) > 0.5
 
@@ -259,25 +342,32 @@ class Grounded(AbstractSystem):
 
     def follows(self, contact, time, state, bounced, left, rests, ends):
         on, struck = state.support >= 0, bounced.flight
-        is_exit = contact >= len(self.scene.surfaces)
+        is_exit, grips = contact >= len(self.scene.surfaces), jnp.asarray(contact == self._end_of_slip)
         floor = self._floor(contact, time, state)
-        first = self._start(time, struck, floor[0])
-        restitution, reversal = self._laws(contact)
+        first, law = self._start(time, struck, floor[0]), self._law(contact)
         is_floor = jnp.any(jnp.stack([contact == i for i in self._floors])) & floor[0].below & (first.pull > 0)
         lasts, sums = self._sums(contact, time, struck, first, floor)
-        dies_out = is_floor & (lasts <= left) & (sums | rests)
+        capped = law.rolls & jnp.isfinite(jnp.inf if law.friction is None else law.friction)
+        dies_out = is_floor & (lasts <= left) & (sums | (rests & ~capped))
         moves = dot(first.slip, first.slip) + dot(first.along, first.along) > 0
-        endless = dies_out & self._rolls(contact) & (abs(reversal) == 1) & (restitution < 1) & moves
-        lies = is_floor & rests
+        endless = dies_out & law.rolls & ~capped & (abs(law.reversal) == 1) & (law.restitution < 1) & moves
+        lies = is_floor & jnp.where(capped, ends, rests)
 
         bounce_or_end = KINDS.where(dies_out, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
         wall = KINDS.where(self._stays(contact, state.support), KINDS.rolling, KINDS.bounce)
-        kind = KINDS.where(on, KINDS.where(is_exit, KINDS.left, wall), bounce_or_end)
+        over = KINDS.where(grips, KINDS.gripped, KINDS.left)
+        kind = KINDS.where(on, KINDS.where(is_exit, over, wall), bounce_or_end)
 
         stuck = ~is_exit & jnp.where(on, rests, ends & ~is_floor)
         fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
         fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
-        fault = RESULTS.where(on & is_exit & self._tips(contact, state, floor[0]), RESULTS.pivoting, fault)
+        fault = RESULTS.where(on & is_exit & ~grips & self._tips(contact, state, floor[0]), RESULTS.pivoting, fault)
+        if self._slips and self.parabolic:
+            after, _ = self.impact(contact, time, state, bounced, kind)
+            below, pull = self._ground(time, after), self._pull(time, after.flight)
+            straight = rolling.is_straight(below.heading, rolling.along_surface(below.face.normal, pull), norm(pull))
+            bends = (after.support >= 0) & ~straight
+            fault = RESULTS.where(bends, RESULTS.curved_slide, fault)
         return kind, fault
 
     def _tips(self, contact: Any, state: Travel, face: Face) -> Any:
@@ -292,54 +382,47 @@ class Grounded(AbstractSystem):
         flight, on, struck = state.flight, state.support >= 0, bounced.flight
         face, _ = self._floor(contact, time, state)
         first = self._start(time, struck, face)
-        is_train, rolls, left = (kind == each for each in (KINDS.train, KINDS.rolling, KINDS.left))
-        settles = ~on & (is_train | rolls)
+        is_train, rolls, left, grips = (
+            kind == each for each in (KINDS.train, KINDS.rolling, KINDS.left, KINDS.gripped)
+        )
+        settles, stays = ~on & (is_train | rolls), on & (rolls | grips)
         first = first._replace(rise=jnp.where(is_train, first.rise, 0.0))
         end = self._summed(contact, first)
         kept = self._against(contact, time, flight, state.support, face.normal)
+        if self._slips:
+            velocity, spin = rolling.gripped(self.scene.ball, face.normal, flight.velocity, flight.spin)
+            kept = kept._replace(velocity=_where(grips, velocity, kept.velocity), spin=_where(grips, spin, kept.spin))
 
-        velocity = _where(left, flight.velocity, _where(on & rolls, kept.velocity, struck.velocity))
-        spin = _where(left, flight.spin, _where(on & rolls, kept.spin, struck.spin))
+        velocity = _where(left, flight.velocity, _where(stays, kept.velocity, struck.velocity))
+        spin = _where(left, flight.spin, _where(stays, kept.spin, struck.spin))
         after = flight._replace(
             position=_where(settles, add(flight.position, end.shift), flight.position),
             velocity=_where(settles, end.velocity, velocity),
             spin=_where(settles & self._rolls(contact), end.spin, spin),
         )
         surface = jnp.asarray(contact).astype(jnp.asarray(state.support).dtype)
-        support = jnp.where(settles, surface, jnp.where(on & rolls, state.support, -1.0))
+        support = jnp.where(settles, surface, jnp.where(stays, state.support, -1.0))
         return Travel(after, support), jnp.where(settles, end.time, 0.0)
 
     def _against(self, contact: Any, time: Any, flight: Flight, support: Any, n: Vector3) -> Flight:
-        """A ball that stays on its support hits another surface. With c = n x n', d = n - n', the one motion that both
-        contacts allow is v = r c, omega = d: v+ = -mu v + (1 + mu) times its projection on that (4.2), Theorem 5.1. A
-        smooth wall reverses only what is normal to it."""
-        ball, x = self.scene.ball, flight.position
-        surfaces = self.scene.surfaces
-        wall = select_vector(contact, [surface.direction(x, time) for surface in surfaces])
+        """A ball that stays on its support hits another surface; where there is friction it may slip afterwards."""
+        ball, surfaces, velocity, spin = self.scene.ball, self.scene.surfaces, flight.velocity, flight.spin
+        wall = select_vector(contact, [surface.direction(flight.position, time) for surface in surfaces])
         mu = select(contact, [surface.law.restitution for surface in surfaces])
         smooth = jnp.asarray(select(contact, [float(surface.law.rolls is False) for surface in surfaces])) > 0.5
-        c, d = cross(n, wall), subtract(n, wall)
-        weight = times(ball.inertia_ratio, ball.radius)
-        both = plus(dot(c, flight.velocity), times(weight, dot(d, flight.spin)))
-        share = ratio(times(plus(1.0, mu), both), plus(dot(c, c), times(ball.inertia_ratio, dot(d, d))))
-        velocity = add(scale(times(-1.0, mu), flight.velocity), scale(share, c))
-        spin = add(scale(times(-1.0, mu), flight.spin), scale(ratio(share, ball.radius), d))
-        into = subtract(wall, scale(dot(wall, n), n))
-        back = ratio(times(plus(1.0, mu), dot(into, flight.velocity)), dot(into, into))
-        turned = subtract(flight.velocity, scale(back, into))
-        rolling = _where(self._rolls(support), self._rolling_spin(n, turned, flight.spin), flight.spin)
-        return flight._replace(velocity=_where(smooth, turned, velocity), spin=_where(smooth, rolling, spin))
+        turned = rolling.against_smooth(n, wall, mu, velocity)
+        firm = self._rolls(support) & ~jnp.isfinite(self._friction(support))
+        carried = _where(firm, rolling.rolling_spin(ball, n, turned, spin), spin)
+        velocity, spin = rolling.against_rough(ball, n, wall, mu, velocity, spin)
+        return flight._replace(velocity=_where(smooth, turned, velocity), spin=_where(smooth, carried, spin))
 
     def during(self, contact, time, state, elapsed):
         """The state so long after the first impact of a train."""
         face, _ = self._face(contact, state.flight.position, time)
         struck = self.scene.bounced(contact, time, state.flight)
         first = self._start(time, struck, face)
-        restitution, reversal = self._laws(contact)
-        count = train.bounces_within(first, restitution, elapsed)
-        ball = self.scene.ball
-        numbers = (restitution, reversal, ball.inertia_ratio, ball.radius, self._rolls(contact))
-        last = train.bounced(first, *numbers, count)
+        law, (slips, _) = self._law(contact), self._regime(contact, first)
+        last = train.bounced(first, law, slips, train.bounces_within(first, law.restitution, elapsed))
         velocity = add(last.velocity, scale(last.rise, first.normal))
         since = jnp.maximum(elapsed - last.time, 0.0)
         gravity = self._pull(time, struck)
@@ -353,7 +436,7 @@ class Grounded(AbstractSystem):
         size: Callable = lambda flight: norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)  # noqa: E731
         face, _ = self._floor(contact, time, before)
         g = components(self.scene.gravity)
-        along = subtract(g, scale(dot(g, face.normal), face.normal))
+        along = rolling.along_surface(face.normal, g)
         still = size(after.flight) <= 64.0 * eps * size(before.flight)
         return (after.support >= 0) & still & (norm(along) <= 64.0 * eps * norm(g)) & (self.scene.air is None)
 
@@ -389,7 +472,22 @@ def _pick(index: Any, keys: Sequence[int], options: Sequence[Number]) -> Number:
     return result
 
 
-def grounded(scene: Scene, tolerance: float) -> Scene | Grounded:
+def grounded(scene: Scene, tolerance: float, parabolic: bool) -> Scene | Grounded:
     """A scene with the motion after the last bounce, if there can be a last one."""
     settles = any(_can_settle(surface) for surface in scene.surfaces)
-    return Grounded(scene, tolerance) if settles else scene
+    return Grounded(scene, tolerance, parabolic) if settles else scene
+
+
+def slides_across(scene: Scene) -> bool:
+    """Whether a ball is known now, not only when the program runs, to meet a slope that it may slide across."""
+    if any(isinstance(leaf, jax.core.Tracer) or jnp.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
+        return False
+    g = components(scene.gravity)
+    above = scale(ratio(-1e6, norm(g)), g)
+    for surface in scene.surfaces:
+        face = surface.face(above, 0.0) if _can_settle(surface) else None
+        if face is not None and surface.law.sliding_friction() is not None:
+            steep = norm(rolling.along_surface(face.normal, g)) > 1e-6 * norm(g)
+            if bool(steep) and bool(dot(face.normal, g) < 0):
+                return True
+    return False

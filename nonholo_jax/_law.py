@@ -7,7 +7,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from ._types import Number
-from ._vector import as_number, is_constant, minimum, plus, ratio, root, times
+from ._vector import as_number, is_constant, minimum, plus, ratio, root, times, where_number
 
 
 class AbstractContactLaw(eqx.Module):
@@ -18,10 +18,15 @@ class AbstractContactLaw(eqx.Module):
 
     restitution: eqx.AbstractVar[Number]
     rolls: ClassVar[bool | None] = None
-    """What a ball does after its last bounce: roll (True), slide freely (False), or nothing that is modelled."""
+    """What a ball does after its last bounce: roll, perhaps after sliding (True), slide freely (False), or nothing that
+    is modelled."""
 
     def reversal(self) -> Number | None:
-        """The share e_t of its slip that every impact reverses, however slow; `None` where it depends on the impact."""
+        """The share e_t of its slip that an impact reverses if it grips; `None` where there is no such number."""
+        return None
+
+    def sliding_friction(self) -> Number | None:
+        """The coefficient f of a ball that slides on the surface after its last bounce; `None` where it cannot."""
         return None
 
     @abstractmethod
@@ -127,7 +132,7 @@ class Frictional(AbstractContactLaw):
     - `friction`: Coulomb coefficient f >= 0.
 
     Raises `ValueError` out of range. Source: Walton's three-parameter law, as in Foerster et al., Phys. Fluids 6,
-    1108 (1994).
+    1108 (1994). After the last bounce the ball slides, with the same coefficient, until it rolls.
 
     ```python
     from nonholo_jax import Frictional
@@ -138,9 +143,19 @@ class Frictional(AbstractContactLaw):
     restitution: Number = eqx.field(converter=as_number)
     tangential: Number = eqx.field(converter=as_number)
     friction: Number = eqx.field(converter=as_number)
+    rolls: ClassVar[bool | None] = True
 
     def __check_init__(self):
         _reject_outside(self)
+
+    def reversal(self) -> Number:
+        return self.tangential
+
+    def sliding_friction(self) -> Number:
+        """0 for e_t = -1: then no impact of a train touches the slip, however slow."""
+        if is_constant(self.tangential):
+            return self.friction if self.tangential > -1 else 0.0
+        return where_number(self.tangential > -1, self.friction, 0.0)
 
     def admissible(self) -> list:
         sentence = f"`friction` must not be negative, but got {self.friction}; 0 is a smooth wall"

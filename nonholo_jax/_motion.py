@@ -117,8 +117,9 @@ class Exact(AbstractMotion):
 
     def piece(self, system, time, state, memory, jumped, size):
         q, v = system.evolving(state)
-        _, a = system.derivative(time, state, q, v)
-        configuration = tuple((x, u, times(0.5, w)) for x, u, w in zip(q, v, a, strict=True))
+        dq, a = system.derivative(time, state, q, v)
+        configuration = tuple((x, u, times(0.5, w)) for x, u, w in zip(q, v, a, strict=False))
+        configuration += tuple((x, u) for x, u in zip(q[len(v) :], dq[len(v) :], strict=True))
         rate = tuple((u, w) for u, w in zip(v, a, strict=True))
         return Piece(Arc(time, state, configuration, rate, size, 1.0), None, None)
 

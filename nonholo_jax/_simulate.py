@@ -8,7 +8,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 
-from ._grounded import grounded
+from ._grounded import grounded, slides_across
 from ._loop import run
 from ._motion import AbstractMotion, Exact
 from ._motion_integrated import Integrated
@@ -48,10 +48,11 @@ def simulate(
     - `max_impacts`: >= 0. A motion that arrives at one impact more stops there, before it, with
         `RESULTS.max_impacts`.
     - `log_size`: rows of the log; `None` for `max_impacts`, 0 for none.
-    - `motion`: `Exact()` or `Integrated(...)`; `None` picks `Exact()` where the scene allows it, else `Integrated()`.
+    - `motion`: `Exact()` or `Integrated(...)`; `None` picks `Exact()` where the scene allows it, else `Integrated()`:
+        with air, a gap of unknown curvature, or friction on a slope, across which a ball slides along a curve.
     - `sum_trains`: bounces on a plane that die out before anything else can happen are summed in closed form, as one
-        row of the log, and the ball goes on rolling (on a `Smooth` surface, sliding). False gives every bounce, and
-        ends as `RESULTS.sustained_contact` where they have died out.
+        row of the log, and the ball goes on rolling (on a `Smooth` surface sliding, on a `Frictional` one sliding until
+        it rolls). False gives every bounce, and ends as `RESULTS.sustained_contact` where they have died out.
     - `adjoint`: how derivatives are taken. `None` finds the path without derivatives and repeats it with them, in
         both modes. `diffrax.ForwardMode()` differentiates the loop itself, forward only, first derivatives only.
         `diffrax.RecursiveCheckpointAdjoint()` likewise, reverse only.
@@ -129,7 +130,7 @@ def _continued(scene: AbstractSystem, motion: AbstractMotion, sum_trains: bool) 
     """The system with the motion after the last bounce, where there may be one."""
     if not (sum_trains and isinstance(scene, Scene)):
         return scene
-    return grounded(scene, float(getattr(motion, "atol", 0.0)))
+    return grounded(scene, float(getattr(motion, "atol", 0.0)), motion.is_closed_form)
 
 
 def _check_scene(scene: Any, axes: tuple) -> None:
@@ -225,7 +226,8 @@ def checked(scene: Any, motion: Any, max_impacts: int, log_size: int | None) -> 
             raise ValueError(f"Argument `{name}` must be a whole number of at least 0, but got {value!r}; try 64.")
     if motion is None:
         bounded = all(scene.is_bounded(i) for i in range(scene.n_contacts))
-        motion = Exact() if scene.is_uniform() and bounded else Integrated()
+        curved = isinstance(scene, Scene) and slides_across(scene)
+        motion = Exact() if scene.is_uniform() and bounded and not curved else Integrated()
     if not isinstance(motion, AbstractMotion):
         raise ValueError(f"Argument `motion` must be None, Exact() or Integrated(), but got {motion!r}; try None.")
     motion.check(scene)

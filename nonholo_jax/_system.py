@@ -35,7 +35,8 @@ class AbstractSystem(eqx.Module):
 
     @abstractmethod
     def is_uniform(self) -> bool:
-        """Whether on every arc v is the rate of q and has a constant rate itself: arcs are then parabolas."""
+        """Whether on every arc v is the rate of as many q and has a constant rate itself, and other q have a constant
+        rate: arcs are then parabolas."""
 
     @abstractmethod
     def advanced(self, time: Scalar, state: Any, q: tuple, v: tuple, duration: Number) -> Any:

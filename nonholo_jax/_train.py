@@ -5,6 +5,9 @@ m = v_t + alpha r (omega x n), so that v_t = (m + alpha u) / (1 + alpha). Flight
 T_0 = 2 w / g_n. An impact keeps m (the angular momentum about the contact) and turns u into -e_t u; a flight adds
 g_t T_k to both. So m grows by g_t t throughout, u_(k+1) = -e_t (u_k + g_t T_k), and the sums of T_k, T_k^2 and u_k T_k
 are geometric. None of them has a pole at e_t = -e_n, where the recurrence is resonant, nor at e_n = 0.
+
+Under Coulomb friction an impact that grips does the same, and one that slips takes f (1 + e_n) (1 + 1/alpha) w_k of the
+slip, geometric too. Trains of one kind only are summed; where impacts of both kinds follow each other they are bounced.
 """
 
 from typing import Any, NamedTuple
@@ -12,7 +15,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from ._types import Number, Vector3
-from ._vector import add, cross, dot, ratio, scale, subtract, times
+from ._vector import add, cross, dot, norm, ratio, scale, subtract, times
 
 
 class Start(NamedTuple):
@@ -55,29 +58,31 @@ def span(first: Start, time: Number) -> Number:
     return time * (speed + 2.0 * slip + 2.0 * pull * time)
 
 
-def summed(
-    first: Start, restitution: Number, reversal: Number, inertia_ratio: Number, radius: Number, rolls: Any
-) -> End:
-    """After all of the bounces. Then the ball rolls, or, on a smooth surface, slides."""
+class Contact(NamedTuple):
+    """What the sums need of a law and of the ball."""
+
+    restitution: Number
+    reversal: Number
+    friction: Number | None  # infinite where the ball never slips; `None` if that is so on all surfaces
+    rolls: Any  # False on a smooth surface
+    inertia_ratio: Number
+    radius: Number
+
+
+def summed(first: Start, contact: Contact, slips: Any) -> End:
+    """After all of the bounces: then the ball rolls, or slides. `slips` says that every impact slips."""
     none = scale(0.0, first.slip)
-    return _after(first, restitution, reversal, inertia_ratio, radius, rolls, 0.0, none)
+    return _after(first, contact, slips, 0.0, none)
 
 
-def bounced(
-    first: Start,
-    restitution: Number,
-    reversal: Number,
-    inertia_ratio: Number,
-    radius: Number,
-    rolls: Any,
-    count: Number,
-) -> End:
+def bounced(first: Start, contact: Contact, slips: Any, count: Number) -> End:
     """After `count` more bounces."""
-    shrunk, turned = restitution**count, _power(-reversal, count)
+    reversal = contact.reversal
+    shrunk, turned = contact.restitution**count, _power(-reversal, count)
     first_flight = ratio(times(2.0, first.rise), first.pull)
-    gain = times(times(-1.0, reversal), times(first_flight, _sum_of_products(restitution, -reversal, count)))
+    gain = times(times(-1.0, reversal), times(first_flight, _sum_of_products(contact.restitution, -reversal, count)))
     slip = add(scale(turned, first.slip), scale(gain, first.along))
-    return _after(first, restitution, reversal, inertia_ratio, radius, rolls, shrunk, slip)
+    return _after(first, contact, slips, shrunk, slip)
 
 
 def bounces_within(first: Start, restitution: Number, time: Number) -> Number:
@@ -88,8 +93,50 @@ def bounces_within(first: Start, restitution: Number, time: Number) -> Number:
     return jnp.where(inside, jnp.floor(count), 0.0)
 
 
-def _after(first, restitution, reversal, inertia_ratio, radius, rolls, shrunk, slip) -> End:
-    """`shrunk` is e_n^k and `slip` the slip after k bounces."""
+def slips_throughout(first: Start, contact: Contact, tolerance: float) -> Any:
+    """Whether every impact slips, in one direction (but for a change of velocity of `tolerance` in m/s). What friction
+    has taken after k bounces, and what is left for it to need, are linear in e_n^k: two ends decide for all k."""
+    assert contact.friction is not None
+    speed = norm(first.slip)
+    helped = ratio(dot(first.slip, first.along), speed)  # by gravity
+    sideways = norm(subtract(first.along, scale(ratio(helped, speed), first.slip)))
+    taken, lasts = _taken(first, contact), _lasts(first, contact)
+    last = speed + helped * lasts - taken * ratio(1.0, 1.0 - contact.restitution)
+    flight = ratio(times(2.0, first.rise), first.pull)
+    begins = (1.0 + contact.reversal) * (speed + helped * flight) >= taken
+    eps = float(jnp.finfo(jnp.result_type(*first.velocity)).eps)
+    straight = sideways <= 64.0 * eps * first.pull
+    straight = straight | (ratio(sideways * lasts, speed) * ratio(taken, 1.0 - contact.restitution) <= tolerance)
+    return (first.rise <= 0) | (straight & (last > 0) & begins & (contact.restitution < 1))
+
+
+def grips_throughout(first: Start, contact: Contact) -> Any:
+    """Whether friction stops the slip at every impact. The slip there over the closing speed, s, goes over into
+    -rho s + gained with rho = e_t / e_n, so that it stays on a segment: from s_0 to s_1, or, for rho < 0, to its limit.
+    """
+    rho = ratio(contact.reversal, contact.restitution)
+    gained = scale(ratio(2.0, first.pull), first.along)
+    start = add(scale(ratio(1.0, first.rise), first.slip), gained)
+    other = tuple(jnp.where(rho < 0, ratio(g, 1.0 + rho, jnp.where(g == 0, 0.0, jnp.inf)), g - rho * s)
+                  for g, s in zip(gained, start, strict=True))  # fmt: skip
+    most = jnp.maximum(norm(start), norm(other))
+    enough = (1.0 + contact.reversal) * most * first.rise <= _taken(first, contact)
+    return (first.rise > 0) & (abs(rho) <= 1) & enough
+
+
+def _taken(first: Start, contact: Contact) -> Number:
+    """What an impact at the velocity `rise` takes of the slip where friction is overcome."""
+    friction = 0.0 if contact.friction is None else jnp.where(jnp.isinf(contact.friction), 0.0, contact.friction)
+    return friction * (1.0 + contact.restitution) * (1.0 + 1.0 / contact.inertia_ratio) * first.rise
+
+
+def _lasts(first: Start, contact: Contact) -> Number:
+    return ratio(times(2.0, first.rise), times(first.pull, 1.0 - contact.restitution))
+
+
+def _after(first: Start, contact: Contact, slips: Any, shrunk: Number, slip: Vector3) -> End:
+    """`shrunk` is e_n^k, and `slip` the slip after k bounces that all grip."""
+    restitution, reversal, _, rolls, inertia_ratio, radius = contact
     flight = ratio(times(2.0, first.rise), first.pull)
     time = ratio(times(flight, 1.0 - shrunk), 1.0 - restitution)
     squares = ratio(1.0 - shrunk * shrunk, 1.0 - restitution * restitution)  # of the durations, in units of T_0^2
@@ -98,6 +145,15 @@ def _after(first, restitution, reversal, inertia_ratio, radius, rolls, shrunk, s
     weighted = subtract(first.slip, scale(shrunk, slip))
     weighted = subtract(weighted, scale(product * flight * squares, first.along))
     weighted = scale(ratio(1.0, 1.0 + product), weighted)
+    if contact.friction is not None:  # slipping, u_k = u_0 + change (1 - e_n^k)
+        loss = _taken(first, contact) * ratio(1.0, 1.0 - restitution)
+        change = scale(_lasts(first, contact), first.along)
+        change = subtract(change, scale(ratio(loss, norm(first.slip)), first.slip))
+        sums = ratio(1.0 - shrunk, 1.0 - restitution)
+        slipping = add(scale(sums, first.slip), scale(sums - squares, change))
+        weighted = tuple(jnp.where(slips, a, b) for a, b in zip(slipping, weighted, strict=True))
+        slipping = add(first.slip, scale(1.0 - shrunk, change))
+        slip = tuple(jnp.where(slips, a, b) for a, b in zip(slipping, slip, strict=True))  # pyright: ignore
     slipped = add(scale(flight, weighted), scale(0.5 * flight * flight * squares, first.along))
     moment = add(scale(1.0 + inertia_ratio, first.velocity), scale(-inertia_ratio, first.slip))
     shift = add(scale(time, moment), scale(0.5 * time * time, first.along))

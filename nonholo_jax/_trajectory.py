@@ -152,6 +152,7 @@ def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any
         point = normal = jnp.full((contact.shape[0], len(system.evolving(outcome.state)[0])), jnp.nan, t0.dtype)
     packed_before, packed_after = jax.vmap(system.packed)(row.before), jax.vmap(system.packed)(row.after)
     rate = frozen(jax.vmap(lambda time, state: _rate(system, time, state))(row.time, before))
+    rate = rate[:, : normal.shape[1]]  # of what the normal is of: a state may evolve more than the gaps see
     closing, speed = jnp.abs(jnp.sum(normal * rate, axis=-1)), jnp.sqrt(jnp.sum(rate**2, axis=-1))
     grazing = used & (closing <= float(jnp.finfo(t0.dtype).eps) ** 0.5 * speed)
     log = ImpactLog(

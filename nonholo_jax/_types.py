@@ -50,6 +50,10 @@ class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
         "The ball stays in contact with a surface (it rests, rolls, or its bounces have died out below rounding). "
         "Try an earlier `t1`, or `throw=False` and `Trajectory.t1` for the time reached."
     )
+    curved_slide = (
+        "The ball slides across a slope, against friction: its slip turns, so that its path is no parabola. Try "
+        "`motion=Integrated()`."
+    )
     barrier_conflict = (
         "At an impact the barrier and the system ask for velocities that contradict each other, or the barrier does "
         "not stop the motion towards it. Try a `constraint` of the Barrier that holds the rows of the system's and "
@@ -93,3 +97,7 @@ class KINDS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     train = "Infinitely many impacts that end in finite time; then the ball stays on the surface. One, if plastic."
     rolling = "An impact after which the ball goes on along the surface that it was on, or comes to lie on one."
     left = "The ball leaves a face over its edge, without an impact."
+    gripped = (
+        "The slip of a ball that slid has died out, without an impact: from here it rolls, or, where it is too steep "
+        "for that, slides downhill."
+    )

@@ -385,12 +385,12 @@ def _caption(scene: Scene, view: View, strikes: Strikes, enlarged: float, fastes
 
 def _title(scene: Scene, trajectory: Any, strikes: Strikes, end: float, title: str | None) -> str:
     if title is None:
-        words = {"left": "off {}", "train": "{} (dying out)"}
+        words = {"left": "off {}", "train": "{} (dying out)", "gripped": "{} (gripped)"}
         names = [words.get(k, "{}").format(scene.names[i]) for i, k in zip(strikes.surface, strikes.kind, strict=True)]
         groups = [(name, len(list(same))) for name, same in groupby(names)]
         words = [f"{name} \N{MULTIPLICATION SIGN}{n}" if n > 1 else name for name, n in groups]
         shown = ", ".join(words[:5]) + (", \N{HORIZONTAL ELLIPSIS}" if len(words) > 5 else "")
-        n = len(names) - strikes.kind.count("left")
+        n = len(names) - sum(strikes.kind.count(kind) for kind in ("left", "gripped"))
         title = f"{n} impact{'s' * (n != 1)}{': ' * bool(names)}{shown}"
     if end >= float(trajectory.t1) and result_name(trajectory.result) != "reached_t1":
         title += f" \N{EN DASH} ended at {end:.4g} s: {result_name(trajectory.result)}"

@@ -33,6 +33,7 @@ ORDER = [
     "_corner",
     "_scene",
     "_train",
+    "_rolling",
     "_grounded",
     # motion
     "_crossing",
