@@ -17,7 +17,7 @@ from ._names import expand, read, write
 from ._scene import Scene
 from ._simulate import checked, simulate
 from ._trajectory import Trajectory
-from ._types import RESULTS, is_failure, result_name
+from ._types import RESULTS, is_failure, result_name, surfaces_hit
 
 _CANDIDATES_PER_START = 64
 _REFUSED = 1e3  # residual, in m, of a motion that fails or leaves the itinerary: worse than any that does not
@@ -134,22 +134,22 @@ def design(
     names = _checked_names(scene, state, free, itinerary, goal, n_starts)
     dtype = state.position.dtype
     tolerance = (1e-6 if dtype == jnp.float64 else 1e-3) if tolerance is None else tolerance
-    times = (jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
-    motion, _ = checked(scene, motion, max_impacts, None)
+    sum_trains = itinerary is None if sum_trains is None else sum_trains
+    motion, _ = checked(scene, motion, max_impacts, None, slides=sum_trains)
     timed = isinstance(goal, AbstractGoal) and goal.passes_after is not None and not motion.is_closed_form
-    how = (max_impacts, motion, itinerary is None if sum_trains is None else sum_trains, timed)
+    how = (max_impacts, motion, sum_trains, timed)
+    times = (jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
     problem = _Problem(scene, state, goal, *times, names, _wanted(scene, itinerary), *how)
     first = read(scene, state, names)
     chart = _chart(scene, state, names, first, _limits(scene, state, names, bounds or {}, dtype))
     initial = _starts(problem, chart, first, n_starts, jax.random.key(0) if key is None else key)
-    solver = _least_squares_solver(solver)
-    begun, found, (miss, met, hit, result, time), steps = _descend(problem, chart, initial, solver, max_steps)
+    descent = _descend(problem, chart, initial, _least_squares_solver(solver), max_steps)
+    begun, found, (miss, met, hit, result, time), steps = descent
     starts = Starts(begun, found, miss, met, steps, hit, result)
     best = _best(starts, chart, first, tolerance)
     values = starts.found[best]
     scene, state = write(scene, state, names, values)
     trajectory = _up_to_goal(problem, values, time[best])
-    evaluations = n_starts * _CANDIDATES_PER_START + int(np.sum(np.asarray(steps)))
     return Design(
         state=state,
         scene=scene,
@@ -158,10 +158,10 @@ def design(
         loss=0.5 * miss[best] ** 2,
         miss=miss[best],
         converged=bool(met[best] & (miss[best] <= tolerance)),
-        itinerary=tuple(scene.names[int(i)] for i in np.asarray(trajectory.impacts.surface) if i >= 0),
+        itinerary=surfaces_hit(scene.names, trajectory.impacts),
         trajectory=trajectory,
         starts=starts,
-        evaluations=evaluations,
+        evaluations=n_starts * _CANDIDATES_PER_START + int(np.sum(np.asarray(steps))),
         tolerance=float(tolerance),
     )
 

@@ -6,22 +6,24 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.core
 import jax.numpy as jnp
+from jax import lax
 
 from . import _rolling as rolling, _train as train
+from ._floors import Floors
 from ._rotation import rolled
 from ._round import round_bend, round_level
 from ._scene import Flight, Scene
-from ._surface import AbstractSurface, Face
-from ._system import AbstractSystem
+from ._surface import Face
+from ._system import AbstractSystem, bounces
 from ._types import KINDS, RESULTS, Number, Vector3
 from ._vector import (
     add,
     components,
     dot,
-    is_constant,
     minimum,
     norm,
     ratio,
@@ -51,13 +53,6 @@ class Travel(NamedTuple):
     below: Ground | None = None  # only while an arc is worked on
 
 
-def _can_settle(surface: AbstractSurface) -> bool:
-    """Whether a ball may roll or slide on a surface after its last bounce, as far as is known when it is traced."""
-    flat = type(surface).face is not AbstractSurface.face
-    elastic = is_constant(surface.law.restitution) and surface.law.restitution == 1
-    return flat and surface.law.rolls is not None and not elastic
-
-
 def _where(condition: Any, a: Sequence[Number], b: Sequence[Number]) -> Any:
     return tuple(where_number(condition, x, y) for x, y in zip(a, b, strict=True))
 
@@ -81,62 +76,24 @@ class Grounded(AbstractSystem):
         return self.scene.names
 
     @property
-    def _floors(self) -> list[int]:
-        return [i for i, surface in enumerate(self.scene.surfaces) if _can_settle(surface)]
-
-    @property
-    def _slips(self) -> bool:
-        """Whether a ball may slide against friction, so that its slip is followed."""
-        return any(self.scene.surfaces[i].law.sliding_friction() is not None for i in self._floors)
+    def _floors(self) -> Floors:
+        return Floors(self.scene)
 
     @property
     def _end_of_slip(self) -> int:
         """The contact at which a slip has died out, behind the surfaces and, where some of them have faces with edges,
         the two pairs of edges of the face below."""
-        edges = any(face.half is not None for face in self._faces((0.0, 0.0, 0.0), 0.0))
-        return len(self.scene.surfaces) + 2 * edges
+        return len(self.scene.surfaces) + 2 * self._floors.have_edges
 
     @property
     def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return (self._end_of_slip + self._slips) if self.hits else 0
-
-    def _faces(self, x: Vector3, time: Any) -> list[Face]:
-        faces = [self.scene.surfaces[i].face(x, time) for i in self._floors]
-        return [face for face in faces if face is not None]
-
-    def _face(self, index: Any, x: Vector3, time: Any) -> tuple[Face, Any]:
-        """The face below a ball on the surface of that index, and whether it has edges."""
-        faces = self._faces(x, time)
-        pick: Callable = lambda options: _pick(index, self._floors, options)  # noqa: E731
-        vector: Callable = lambda options: tuple(pick([o[k] for o in options]) for k in range(3))  # noqa: E731
-        half = [(1.0, 1.0) if face.half is None else face.half for face in faces]
-        face = Face(
-            vector([face.normal for face in faces]),
-            vector([face.center for face in faces]),
-            (vector([face.tangents[0] for face in faces]), vector([face.tangents[1] for face in faces])),
-            (pick([h[0] for h in half]), pick([h[1] for h in half])),
-            pick([jnp.where(face.below, 1.0, 0.0) for face in faces]) > 0.5,
-        )
-        return face, pick([0.0 if each.half is None else 1.0 for each in faces])
-
-    def _rolls(self, index: Any) -> Any:
-        """Whether a ball rolls on the surface of that index, perhaps after sliding."""
-        laws = [self.scene.surfaces[i].law for i in self._floors]
-        frictions = [law.sliding_friction() for law in laws]
-        flags = [(1.0 if law.rolls else 0.0) if f is None else jnp.where(jnp.asarray(f) > 0, 1.0, 0.0)
-                 for law, f in zip(laws, frictions, strict=True)]  # fmt: skip
-        return jnp.asarray(_pick(index, self._floors, flags)) > 0.5
-
-    def _friction(self, index: Any) -> Number:
-        """The coefficient on the surface of that index; infinite where a ball never slides or never rolls."""
-        frictions = [self.scene.surfaces[i].law.sliding_friction() for i in self._floors]
-        return _pick(index, self._floors, [jnp.inf if f is None else f for f in frictions])
+        return (self._end_of_slip + self._floors.have_friction) if self.hits else 0
 
     # Smooth motion
 
     def evolving(self, state: Travel):
         position, velocity = self.scene.evolving(state.flight)
-        if not self._slips:
+        if not self._floors.have_friction:
             return position, velocity
         return (*position, *(rolling.NONE if state.below is None else state.below.slip)), velocity
 
@@ -148,11 +105,11 @@ class Grounded(AbstractSystem):
 
     def _ground(self, time: Any, state: Travel) -> Ground:
         flight = state.flight
-        face, edged = self._face(state.support, flight.position, time)
-        if not self._slips:
+        face, edged = self._floors.face(state.support, flight.position, time)
+        if not self._floors.have_friction:
             return Ground(face, edged, rolling.NONE, rolling.NONE)
-        ball, n, friction = self.scene.ball, face.normal, self._friction(state.support)
-        slides = (state.support >= 0) & self._rolls(state.support) & jnp.isfinite(friction)
+        ball, n, friction = self.scene.ball, face.normal, self._floors.friction(state.support)
+        slides = (state.support >= 0) & self._floors.rolls(state.support) & jnp.isfinite(friction)
         slip = rolling.own_slip(ball, n, flight.velocity, flight.spin)
         slip = _where(slides, slip, rolling.NONE)
         a = self._pull(time, flight)
@@ -164,7 +121,7 @@ class Grounded(AbstractSystem):
     def derivative(self, time, state, q, v):
         flight, on = state.flight, state.support >= 0
         below, ball = self._below(time, state), self.scene.ball
-        n, rolls = below.face.normal, on & self._rolls(state.support)
+        n, rolls = below.face.normal, on & self._floors.rolls(state.support)
         q, slip = q[:3], q[3:]
         if self.scene.air is not None:
             turning = subtract(v, slip) if slip else v
@@ -177,17 +134,17 @@ class Grounded(AbstractSystem):
         if not slip:
             return v, _where(on, scale(jnp.where(rolls, taken, 1.0), along), a)
         slides = dot(below.heading, below.heading) > 0
-        friction = jnp.where(slides, self._friction(state.support), 0.0) * dot(a, n)
+        friction = jnp.where(slides, self._floors.friction(state.support), 0.0) * dot(a, n)
         kick = scale(friction, rolling.later_heading(slip, below.heading))
         share = jnp.where(rolls & ~slides, taken, 1.0)
         changes = add(along, scale(1.0 + 1.0 / ball.inertia_ratio, kick))
         return (*v, *_where(slides, changes, rolling.NONE)), _where(on, add(scale(share, along), kick), a)
 
     def advanced(self, time, state, q, v, duration):
-        rolls = (state.support >= 0) & self._rolls(state.support)
+        rolls = (state.support >= 0) & self._floors.rolls(state.support)
         flight = self.scene.advanced(time, state.flight, q[:3], v, duration)
         below, ball = self._below(time, state), self.scene.ball
-        slips = (below.slip, q[3:] if self._slips else rolling.NONE)
+        slips = (below.slip, q[3:] if self._floors.have_friction else rolling.NONE)
         before, after = (rolling.rolling_spin(ball, below.face.normal, subtract(u, slip), flight.spin)
                          for u, slip in zip((state.flight.velocity, v), slips, strict=True))  # fmt: skip
         orientation = flight.orientation
@@ -259,7 +216,7 @@ class Grounded(AbstractSystem):
 
     def _floor(self, contact: Any, time: Any, state: Travel) -> tuple[Face, Any]:
         """The face that the ball is on, or else that of the surface that it hits; and whether it has edges."""
-        return self._face(jnp.where(state.support >= 0, self.phase(state), contact), state.flight.position, time)
+        return self._floors.face(jnp.where(state.support >= 0, self.phase(state), contact), state.flight.position, time)
 
     def _start(self, time: Any, struck: Flight, face: Face) -> train.Start:
         """What a train begins with, after the first impact."""
@@ -270,22 +227,9 @@ class Grounded(AbstractSystem):
         _, a = self.scene.derivative(time, flight, flight.position, flight.velocity)
         return a
 
-    def _law(self, contact: Any) -> train.Contact:
-        """What trains need of the surface of that index, if it is one to settle on."""
-        laws, ball = [self.scene.surfaces[i].law for i in self._floors], self.scene.ball
-        reversals: list = [law.reversal() for law in laws]
-        return train.Contact(
-            _pick(contact, self._floors, [law.restitution for law in laws]),
-            _pick(contact, self._floors, reversals),
-            self._friction(contact) if self._slips else None,
-            self._rolls(contact),
-            ball.inertia_ratio,
-            ball.radius,
-        )
-
     def _regime(self, contact: Any, first: train.Start) -> tuple[Any, Any]:
         """Whether all impacts of a train slip, and whether all of them grip."""
-        law = self._law(contact)
+        law = self._floors.law(contact)
         if law.friction is None:
             return jnp.asarray(False), jnp.asarray(True)
         limited = law.rolls & jnp.isfinite(law.friction)
@@ -295,7 +239,7 @@ class Grounded(AbstractSystem):
 
     def _summed(self, contact: Any, first: train.Start) -> train.End:
         slips, _ = self._regime(contact, first)
-        return train.summed(first, self._law(contact), slips)
+        return train.summed(first, self._floors.law(contact), slips)
 
     def _room(self, contact: Any, x: Vector3, time: Any, face: Face, edged: Any) -> Number:
         """How far the centre can go from a place on a surface without meeting another, or the face's edge."""
@@ -312,7 +256,7 @@ class Grounded(AbstractSystem):
     def _sums(self, contact: Any, time: Any, struck: Flight, first: train.Start, floor: tuple) -> tuple[Any, Any]:
         """How long the train lasts, and whether it can be summed: no other surface nor an edge can be reached before it
         ends, and air changes nothing."""
-        lasts = train.duration(first, self._law(contact).restitution)
+        lasts = train.duration(first, self._floors.law(contact).restitution)
         lasts_known = jnp.where(jnp.isfinite(lasts), lasts, 0.0)
         height = ratio(first.rise * first.rise, 2.0 * first.pull)
         clear = train.span(first, lasts_known) + height < self._room(contact, struck.position, time, *floor)
@@ -329,7 +273,7 @@ class Grounded(AbstractSystem):
     def _stays(self, contact: Any, support: Any) -> Any:
         """Whether a ball on `support` stays on it when it hits a surface: Theorem 5.1 needs one common mu there, and a
         smooth wall turns the ball round."""
-        rolls = self._rolls(support) & ~jnp.isfinite(self._friction(support))
+        rolls = self._floors.holds(support)
         stays = []
         for surface in self.scene.surfaces:
             law = surface.law
@@ -341,11 +285,23 @@ class Grounded(AbstractSystem):
         return Travel(self.scene.bounced(contact, time, state.flight), state.support)
 
     def follows(self, contact, time, state, bounced, left, rests, ends):
+        face, _ = self._floor(contact, time, state)
+        first = self._start(time, bounced.flight, face)
+        is_floor = self._floors.include(contact) & face.below & (first.pull > 0)
+        soon = is_floor & ((train.duration(first, self._floors.law(contact).restitution) <= left) | rests)
+        arguments = (contact, time, state, bounced, left, rests, ends)
+        return self._if_any((state.support >= 0) | soon, lambda: self._settling(*arguments), lambda: bounces(ends))
+
+    def _if_any(self, condition: Any, wanted: Callable, plain: Callable) -> Any:
+        """`wanted()` if a condition holds in any lane of a batch: otherwise `plain()`, which must be equal then."""
+        return lax.cond(eqxi.unvmap_any(condition), wanted, plain)
+
+    def _settling(self, contact, time, state, bounced, left, rests, ends):
         on, struck = state.support >= 0, bounced.flight
         is_exit, grips = contact >= len(self.scene.surfaces), jnp.asarray(contact == self._end_of_slip)
         floor = self._floor(contact, time, state)
-        first, law = self._start(time, struck, floor[0]), self._law(contact)
-        is_floor = jnp.any(jnp.stack([contact == i for i in self._floors])) & floor[0].below & (first.pull > 0)
+        first, law = self._start(time, struck, floor[0]), self._floors.law(contact)
+        is_floor = self._floors.include(contact) & floor[0].below & (first.pull > 0)
         lasts, sums = self._sums(contact, time, struck, first, floor)
         capped = law.rolls & jnp.isfinite(jnp.inf if law.friction is None else law.friction)
         dies_out = is_floor & (lasts <= left) & (sums | (rests & ~capped))
@@ -362,7 +318,7 @@ class Grounded(AbstractSystem):
         fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
         fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
         fault = RESULTS.where(on & is_exit & ~grips & self._tips(contact, state, floor[0]), RESULTS.pivoting, fault)
-        if self._slips and self.parabolic:
+        if self._floors.have_friction and self.parabolic:
             after, _ = self.impact(contact, time, state, bounced, kind)
             below, pull = self._ground(time, after), self._pull(time, after.flight)
             straight = rolling.is_straight(below.heading, rolling.along_surface(below.face.normal, pull), norm(pull))
@@ -379,6 +335,14 @@ class Grounded(AbstractSystem):
         return speed * speed < pull * self.scene.ball.radius * (1.0 + 1e-5)
 
     def impact(self, contact, time, state, bounced, kind):
+        as_arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=time.dtype), tree)  # noqa: E731
+        return self._if_any(
+            (state.support >= 0) | (kind != KINDS.bounce),
+            lambda: as_arrays(self._settled(contact, time, state, bounced, kind)),
+            lambda: as_arrays((Travel(bounced.flight, -1.0), 0.0)),
+        )
+
+    def _settled(self, contact, time, state, bounced, kind):
         flight, on, struck = state.flight, state.support >= 0, bounced.flight
         face, _ = self._floor(contact, time, state)
         first = self._start(time, struck, face)
@@ -389,7 +353,7 @@ class Grounded(AbstractSystem):
         first = first._replace(rise=jnp.where(is_train, first.rise, 0.0))
         end = self._summed(contact, first)
         kept = self._against(contact, time, flight, state.support, face.normal)
-        if self._slips:
+        if self._floors.have_friction:
             velocity, spin = rolling.gripped(self.scene.ball, face.normal, flight.velocity, flight.spin)
             kept = kept._replace(velocity=_where(grips, velocity, kept.velocity), spin=_where(grips, spin, kept.spin))
 
@@ -398,7 +362,7 @@ class Grounded(AbstractSystem):
         after = flight._replace(
             position=_where(settles, add(flight.position, end.shift), flight.position),
             velocity=_where(settles, end.velocity, velocity),
-            spin=_where(settles & self._rolls(contact), end.spin, spin),
+            spin=_where(settles & self._floors.rolls(contact), end.spin, spin),
         )
         surface = jnp.asarray(contact).astype(jnp.asarray(state.support).dtype)
         support = jnp.where(settles, surface, jnp.where(stays, state.support, -1.0))
@@ -411,25 +375,27 @@ class Grounded(AbstractSystem):
         mu = select(contact, [surface.law.restitution for surface in surfaces])
         smooth = jnp.asarray(select(contact, [float(surface.law.rolls is False) for surface in surfaces])) > 0.5
         turned = rolling.against_smooth(n, wall, mu, velocity)
-        firm = self._rolls(support) & ~jnp.isfinite(self._friction(support))
+        firm = self._floors.holds(support)
         carried = _where(firm, rolling.rolling_spin(ball, n, turned, spin), spin)
         velocity, spin = rolling.against_rough(ball, n, wall, mu, velocity, spin)
         return flight._replace(velocity=_where(smooth, turned, velocity), spin=_where(smooth, carried, spin))
 
     def during(self, contact, time, state, elapsed):
         """The state so long after the first impact of a train."""
-        face, _ = self._face(contact, state.flight.position, time)
+        face, _ = self._floors.face(contact, state.flight.position, time)
         struck = self.scene.bounced(contact, time, state.flight)
         first = self._start(time, struck, face)
-        law, (slips, _) = self._law(contact), self._regime(contact, first)
+        law, (slips, _) = self._floors.law(contact), self._regime(contact, first)
         last = train.bounced(first, law, slips, train.bounces_within(first, law.restitution, elapsed))
         velocity = add(last.velocity, scale(last.rise, first.normal))
         since = jnp.maximum(elapsed - last.time, 0.0)
         gravity = self._pull(time, struck)
         fall = add(scale(since, velocity), scale(0.5 * since * since, gravity))
         position = add(add(struck.position, last.shift), fall)
-        return Travel(struck._replace(position=position, velocity=add(velocity, scale(since, gravity)),
-                                      spin=_where(self._rolls(contact), last.spin, struck.spin)), -1.0)  # fmt: skip
+        spin = _where(law.rolls, last.spin, struck.spin)
+        return Travel(
+            struck._replace(position=position, velocity=add(velocity, scale(since, gravity)), spin=spin), -1.0
+        )
 
     def is_at_rest(self, contact, time, before, after):
         eps = float(jnp.finfo(after.flight.position[0].dtype).eps)
@@ -464,30 +430,6 @@ class Grounded(AbstractSystem):
         return dataclasses.replace(self, hits=False)
 
 
-def _pick(index: Any, keys: Sequence[int], options: Sequence[Number]) -> Number:
-    """The option whose key is `index`; the last one for every other index."""
-    result = options[-1]
-    for key, option in zip(keys[-2::-1], options[-2::-1], strict=True):
-        result = where_number(index == key, option, result)
-    return result
-
-
 def grounded(scene: Scene, tolerance: float, parabolic: bool) -> Scene | Grounded:
     """A scene with the motion after the last bounce, if there can be a last one."""
-    settles = any(_can_settle(surface) for surface in scene.surfaces)
-    return Grounded(scene, tolerance, parabolic) if settles else scene
-
-
-def slides_across(scene: Scene) -> bool:
-    """Whether a ball is known now, not only when the program runs, to meet a slope that it may slide across."""
-    if any(isinstance(leaf, jax.core.Tracer) or jnp.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
-        return False
-    g = components(scene.gravity)
-    above = scale(ratio(-1e6, norm(g)), g)
-    for surface in scene.surfaces:
-        face = surface.face(above, 0.0) if _can_settle(surface) else None
-        if face is not None and surface.law.sliding_friction() is not None:
-            steep = norm(rolling.along_surface(face.normal, g)) > 1e-6 * norm(g)
-            if bool(steep) and bool(dot(face.normal, g) < 0):
-                return True
-    return False
+    return Grounded(scene, tolerance, parabolic) if Floors(scene).indices else scene

@@ -8,7 +8,8 @@ import jax
 import jax.core
 import jax.numpy as jnp
 
-from ._grounded import grounded, slides_across
+from ._floors import slides_across
+from ._grounded import grounded
 from ._loop import run
 from ._motion import AbstractMotion, Exact
 from ._motion_integrated import Integrated
@@ -69,13 +70,13 @@ def simulate(
     trajectory.final.position, trajectory.n_impacts
     ```
     """
-    motion, log_rows = checked(scene, motion, max_impacts, log_size)
+    _check_scene(scene, tuple(_axes(scene, None)))
+    motion, log_rows = checked(scene, motion, max_impacts, log_size, slides=sum_trains)
     system = _continued(scene, motion, sum_trains)
     state = scene.received(state, batch=False, t0=t0)
     dtype = jax.tree.leaves(state)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)
-    _check_scene(scene, tuple(_axes(scene, None)))
     trajectory = _run(system, motion, state, t0, t1, max_impacts, log_rows, adjoint)
     return _raised(trajectory) if throw else trajectory
 
@@ -114,14 +115,15 @@ def simulate_batch(
     simulate_batch(scene, throws, t1=1.0).final.position.mean(axis=0)
     ```
     """
-    motion, log_rows = checked(scene, motion, max_impacts, log_size)
+    axes = tuple(_axes(scene, scene_axes))
+    _check_scene(scene, axes)
+    one_scene = all(axis is None for axis in axes)
+    motion, log_rows = checked(scene, motion, max_impacts, log_size, slides=sum_trains and one_scene)
     system = _continued(scene, motion, sum_trains)
     states = scene.received(states, batch=True, t0=t0)
     dtype = jax.tree.leaves(states)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)
-    axes = tuple(_axes(scene, scene_axes))
-    _check_scene(scene, axes)
     trajectory = _run_batch(system, motion, states, t0, t1, axes, max_impacts, log_rows, adjoint)
     return _raised(trajectory) if throw else trajectory
 
@@ -216,7 +218,9 @@ def _axes(scene: Any, scene_axes: Any) -> list:
     return [axis if eqx.is_array(leaf) else None for axis, leaf in zip(spread, leaves, strict=True)]
 
 
-def checked(scene: Any, motion: Any, max_impacts: int, log_size: int | None) -> tuple[AbstractMotion, int]:
+def checked(
+    scene: Any, motion: Any, max_impacts: int, log_size: int | None, slides: bool
+) -> tuple[AbstractMotion, int]:
     if not isinstance(scene, AbstractSystem):
         raise ValueError(
             f"Argument `scene` must be a Scene, but got {type(scene).__name__}; try Scene(ball, surfaces)."
@@ -226,7 +230,7 @@ def checked(scene: Any, motion: Any, max_impacts: int, log_size: int | None) -> 
             raise ValueError(f"Argument `{name}` must be a whole number of at least 0, but got {value!r}; try 64.")
     if motion is None:
         bounded = all(scene.is_bounded(i) for i in range(scene.n_contacts))
-        curved = isinstance(scene, Scene) and slides_across(scene)
+        curved = slides and isinstance(scene, Scene) and slides_across(scene)
         motion = Exact() if scene.is_uniform() and bounded and not curved else Integrated()
     if not isinstance(motion, AbstractMotion):
         raise ValueError(f"Argument `motion` must be None, Exact() or Integrated(), but got {motion!r}; try None.")

@@ -1,6 +1,6 @@
 """Words shared by every file: array shapes and the ways in which a motion can end."""
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import equinox.internal as eqxi
 from jaxtyping import Array, Float, Int
@@ -61,6 +61,7 @@ class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
+NO_IMPACTS = ("left", "gripped")
 NAMES_OF_RESULTS = tuple(RESULTS._name_to_item)
 
 
@@ -77,6 +78,12 @@ def is_failure(result: RESULTS):
 def result_name(result: RESULTS) -> str:
     """The name of one concrete result, such as `"reached_t1"`."""
     return NAMES_OF_RESULTS[int(result._value)]  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def surfaces_hit(names: tuple[str, ...], log: Any) -> tuple[str, ...]:
+    """The names of the surfaces of one concrete log, in the order in which they were hit."""
+    rows = [(int(surface), kind_name(log.kind, i)) for i, surface in enumerate(log.surface) if surface >= 0]
+    return tuple(names[surface] for surface, kind in rows if kind not in NO_IMPACTS)
 
 
 def kind_name(kind: "KINDS", row: int) -> str:

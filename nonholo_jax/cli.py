@@ -245,7 +245,7 @@ def _motion(scene: Any, trajectory: Any) -> dict[str, Any]:
     import jax
     import numpy as np
 
-    from ._types import kind_name
+    from ._types import NO_IMPACTS, kind_name
 
     log = jax.tree.map(np.asarray, trajectory.impacts)
     impacts = []
@@ -266,7 +266,7 @@ def _motion(scene: Any, trajectory: Any) -> dict[str, Any]:
         )
     final, initial = _state(trajectory.final), _state(trajectory.initial)
     return {
-        "itinerary": [impact["surface"] for impact in impacts if impact["kind"] not in ("left", "gripped")],
+        "itinerary": [impact["surface"] for impact in impacts if impact["kind"] not in NO_IMPACTS],
         "impacts": impacts,
         "final": final,
         "time": float(trajectory.t1),

@@ -15,7 +15,7 @@ import numpy as np
 from ._outline import View, as_numpy, axis_name, half_plane, room, views
 from ._samples import Samples, Strikes, end_of, energies, sample
 from ._scene import Scene
-from ._types import result_name
+from ._types import NO_IMPACTS, result_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -390,7 +390,7 @@ def _title(scene: Scene, trajectory: Any, strikes: Strikes, end: float, title: s
         groups = [(name, len(list(same))) for name, same in groupby(names)]
         words = [f"{name} \N{MULTIPLICATION SIGN}{n}" if n > 1 else name for name, n in groups]
         shown = ", ".join(words[:5]) + (", \N{HORIZONTAL ELLIPSIS}" if len(words) > 5 else "")
-        n = len(names) - sum(strikes.kind.count(kind) for kind in ("left", "gripped"))
+        n = len(names) - sum(strikes.kind.count(kind) for kind in NO_IMPACTS)
         title = f"{n} impact{'s' * (n != 1)}{': ' * bool(names)}{shown}"
     if end >= float(trajectory.t1) and result_name(trajectory.result) != "reached_t1":
         title += f" \N{EN DASH} ended at {end:.4g} s: {result_name(trajectory.result)}"

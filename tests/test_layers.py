@@ -34,6 +34,7 @@ ORDER = [
     "_scene",
     "_train",
     "_rolling",
+    "_floors",
     "_grounded",
     # motion
     "_crossing",
