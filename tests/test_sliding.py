@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from helpers import result_of, results_of, stacked
 
 from nonholo_jax import (
+    Air,
     Ball,
     BallState,
     Box,
@@ -279,6 +281,36 @@ def test_gradients_through_a_slide():
     np.testing.assert_allclose(forward, reverse, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(forward, (8.0 * a - b) / (12.0 * h), rtol=1e-6, atol=1e-6)
     assert np.abs(forward[0, 10]) > 1e-3
+
+
+def test_gradients_with_air():
+    """The same by a solver, on a table with a wall: bounces, train, slide, wall, slide back to it, rolling along it."""
+    steps = {"solver": diffrax.Heun(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.02}
+    motion = Integrated(**steps, atol=1e-13)  # the sum of a train may neglect only what differences do not see
+
+    def end(p, t1):
+        e, f, vx, vy, turn, drag = p
+        surfaces = {
+            "table": Box((1.0, 0.0, -0.1), (2.0, 2.0, 0.1), Frictional(e, 0.1 * e, f)),
+            "wall": Plane((2.2, 0.0, 0.0), (-1.0, 0.0, 0.0), Smooth(e)),
+        }
+        state = throw(jnp.stack([vx, vy, 0.0 * vx]), jnp.stack([0.0 * vx, turn, 0.0 * vx]))
+        scene = Scene(BALL, surfaces, air=Air(drag=drag, lift=0.3))
+        trajectory = simulate(scene, state, t1=t1, motion=motion, max_impacts=20, throw=False)
+        return jnp.concatenate([stacked(trajectory.final), trajectory.n_impacts[None].astype(p.dtype)])
+
+    p, h = jnp.asarray([0.3, 0.2, 3.5, 0.3, -20.0, 0.3]), 2e-5
+    modes = [jax.jit(mode(end)) for mode in (jax.jacfwd, jax.jacrev)]
+    value = jax.jit(jax.vmap(end, in_axes=(0, None)))
+    points = jnp.stack([p + k * h * step for k in (1, -1, 2, -2) for step in jnp.eye(p.size)])
+    for t1, least in ((0.6, 11), (1.1, 12), (2.0, 13)):
+        forward, reverse = (mode(p, t1) for mode in modes)
+        near, back, far, farther = value(points, t1).reshape(4, p.size, -1)
+        assert near[:, -1].min() == farther[:, -1].max() >= least
+        difference = ((8.0 * (near - back) - (far - farther)) / (12.0 * h)).T
+        scale = 1.0 + jnp.abs(forward)
+        np.testing.assert_allclose(reverse / scale, forward / scale, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(forward / scale, difference / scale, rtol=0, atol=1e-6)
 
 
 def test_single_precision():
