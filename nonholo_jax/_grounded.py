@@ -43,6 +43,7 @@ class Ground(NamedTuple):
     edged: Any  # whether the face has edges
     slip: Vector3  # zero of a ball that rolls, and where there is no friction to slide against
     heading: Vector3  # the direction in which it slides against friction, or zero
+    straight: Any  # whether it keeps that direction until its slip ends
 
 
 class Travel(NamedTuple):
@@ -107,16 +108,17 @@ class Grounded(AbstractSystem):
         flight = state.flight
         face, edged = self._floors.face(state.support, flight.position, time)
         if not self._floors.have_friction:
-            return Ground(face, edged, rolling.NONE, rolling.NONE)
+            return Ground(face, edged, rolling.NONE, rolling.NONE, True)
         ball, n, friction = self.scene.ball, face.normal, self._floors.friction(state.support)
         slides = (state.support >= 0) & self._floors.rolls(state.support) & jnp.isfinite(friction)
         slip = rolling.own_slip(ball, n, flight.velocity, flight.spin)
         slip = _where(slides, slip, rolling.NONE)
         a = self._pull(time, flight)
         most = jnp.where(slides, friction, 0.0) * -dot(a, n) * (1.0 + 1.0 / ball.inertia_ratio)
-        return Ground(
-            face, edged, slip, _where(slides, rolling.heading(slip, rolling.along_surface(n, a), most), rolling.NONE)
-        )
+        along = rolling.along_surface(n, a)
+        heading = _where(slides, rolling.heading(slip, along, most), rolling.NONE)
+        straight = self.parabolic or rolling.stays_straight(heading, slip, along, most, self.tolerance)
+        return Ground(face, edged, slip, heading, straight)
 
     def derivative(self, time, state, q, v):
         flight, on = state.flight, state.support >= 0
@@ -129,16 +131,23 @@ class Grounded(AbstractSystem):
                 spin=_where(rolls, rolling.rolling_spin(ball, n, turning, flight.spin), flight.spin)
             )
         _, a = self.scene.derivative(time, flight, q, v)
-        along = rolling.along_surface(n, a)
-        taken = 1.0 / (1.0 + ball.inertia_ratio)  # what the spin does not take
-        if not slip:
-            return v, _where(on, scale(jnp.where(rolls, taken, 1.0), along), a)
-        slides = dot(below.heading, below.heading) > 0
-        friction = jnp.where(slides, self._floors.friction(state.support), 0.0) * dot(a, n)
-        kick = scale(friction, rolling.later_heading(slip, below.heading))
-        share = jnp.where(rolls & ~slides, taken, 1.0)
-        changes = add(along, scale(1.0 + 1.0 / ball.inertia_ratio, kick))
-        return (*v, *_where(slides, changes, rolling.NONE)), _where(on, add(scale(share, along), kick), a)
+        along, alpha = rolling.along_surface(n, a), ball.inertia_ratio
+        changes = self._slip_rate(state, below, slip, along, dot(a, n)) if slip else ()
+        # Friction leaves v + alpha r (omega x n) alone, so that (1 + alpha) v - alpha u changes by gravity only.
+        rolling_rate = add(along, scale(alpha, changes)) if slip else along
+        rate = _where(rolls, scale(1.0 / (1.0 + alpha), rolling_rate), along)
+        return (*v, *changes), _where(on, rate, a)
+
+    def _slip_rate(self, state: Travel, below: Ground, slip: Vector3, along: Vector3, push: Number) -> Vector3:
+        """The rate of the slip, zero for a ball that does not slide against friction."""
+        slides, heading = dot(below.heading, below.heading) > 0, below.heading
+        most = jnp.where(slides, self._floors.friction(state.support), 0.0) * -push
+        most = most * (1.0 + 1.0 / self.scene.ball.inertia_ratio)
+        rate = scale(dot(along, heading) - most, heading)
+        if not self.parabolic:
+            turning = subtract(along, scale(most, rolling.later_heading(slip, heading)))
+            rate = _where(below.straight, rate, turning)
+        return _where(slides, rate, rolling.NONE)
 
     def advanced(self, time, state, q, v, duration):
         rolls = (state.support >= 0) & self._floors.rolls(state.support)

@@ -60,9 +60,21 @@ def later_heading(slip: Vector3, known: Vector3) -> Vector3:
 
 def is_straight(known: Vector3, along: Vector3, pull: Number) -> Any:
     """Whether gravity along the surface leaves the direction of the slip as it is."""
-    sideways = norm(subtract(along, scale(dot(known, along), known)))
     eps = float(jnp.finfo(jnp.result_type(*known)).eps)
-    return (dot(known, known) == 0) | (sideways <= 64.0 * eps * abs(pull))
+    return (dot(known, known) == 0) | (_sideways(known, along) <= 64.0 * eps * abs(pull))
+
+
+def stays_straight(known: Vector3, slip: Vector3, along: Vector3, most: Number, tolerance: float) -> Any:
+    """Whether the end of the slip is so near that its direction may be kept, for a velocity of 100 `tolerance` and a
+    way of `tolerance` (m/s and m). The direction settles at the rate |g_t| / |u|, which is faster than any explicit
+    solver can follow: where friction hardly exceeds gravity, it would not come to the end without this."""
+    decay, speed = most - dot(known, along), norm(slip)
+    aside = ratio(speed * _sideways(known, along), norm(along))
+    return (decay > 0) & (aside <= 100.0 * tolerance) & (aside * speed <= tolerance * decay)
+
+
+def _sideways(known: Vector3, along: Vector3) -> Number:
+    return norm(subtract(along, scale(dot(known, along), known)))
 
 
 def gripped(ball: Ball, normal: Vector3, velocity: Vector3, spin: Vector3) -> tuple[Vector3, Vector3]:

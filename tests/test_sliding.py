@@ -204,6 +204,20 @@ def test_slides_across_a_slope(across):
     assert results_of(trajectory) == ["reached_t1"] * len(cases)
 
 
+def test_slides_across_a_slope_that_it_could_hardly_roll_on():
+    """F = 1.01 h: the direction settles a hundred times as fast as the slip dies out, and the end is still found."""
+    n = np.asarray(SLOPE) / np.linalg.norm(SLOPE)
+    h, most = TAN * G * n[2], 1.01 * TAN * G * n[2]
+    scene = plane_scene(Frictional(0.0, 0.2, 1.01 * TAN * ALPHA / (1.0 + ALPHA)), SLOPE)
+    state = BallState([0.0, 0.0, R / n[2] + 1e-3], [0.0, 0.1, -0.1], [0.0, 0.0, 0.0])
+    trajectory = simulate(scene, state, t1=6.0)
+    assert kinds(trajectory) == ["train", "gripped"] and int(trajectory.n_arcs) < 1000
+    start = slip_of(lane_of(trajectory.impacts.after, 0), SLOPE)
+    clock = np.linalg.norm(start) * most + start @ (np.array([0.0, 0.0, -G]) + G * n[2] * n)
+    lasts = float(trajectory.impacts.time[1] - trajectory.impacts.until[0])
+    np.testing.assert_allclose(lasts, clock / (most**2 - h**2), rtol=1e-4)
+
+
 def test_motion_that_a_slope_needs():
     """A known slope is integrated by default; asked for parabolas, the motion ends with a name before it slides."""
     state = throw((0.5, 1.5, -0.5), (-30.0, 0.0, 4.0))
