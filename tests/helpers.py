@@ -1,5 +1,6 @@
 """The one registry of laws, surfaces and motions. A new class gets one line here; every shared test then runs on it."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -29,6 +30,9 @@ from nonholo_jax import (
 )
 from nonholo_jax._types import result_name
 from nonholo_jax._vector import select
+
+# Compiled for derivatives by the dozen, each run once: without the slow passes of the compiler.
+fast_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 BALL = {"radius": 0.1, "mass": 0.7, "inertia_ratio": 0.4}

@@ -20,6 +20,7 @@ from helpers import (
     all_motions,
     all_surfaces,
     arrays,
+    fast_jit,
     lane,
     named,
     scene_of,
@@ -97,10 +98,6 @@ def batch_of(case, key, dtype=np.float64):
     throw = throws(case, key, n, flight=(0.15, 0.25), dtype=dtype)
     flat = jnp.stack([ravel_pytree(all_numbers(case, lane(throw, i), dtype))[0] for i in range(n)])
     return flat, jnp.repeat(jnp.arange(len(all_laws), dtype=jnp.int32), PER_LAW)
-
-
-# Compiled for derivatives by the dozen, each run once: without the slow passes of the compiler.
-fast_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def both_modes(function, flat, index):
