@@ -128,6 +128,8 @@ def rolls(d: Draw, v1: np.ndarray, v2: np.ndarray, w3: np.ndarray) -> np.ndarray
 
 impacts = jax.jit(jax.vmap(collide))
 projectors = jax.jit(jax.vmap(projector))
+slips_at_floor = jax.jit(jax.vmap(lambda scene, state: slip(scene, state, "floor")))
+momenta_about = jax.jit(jax.vmap(momentum_about))
 
 
 def constraints(d: Draw) -> list[Check]:
@@ -140,8 +142,8 @@ def constraints(d: Draw) -> list[Check]:
     size = np.linalg.norm(level, axis=-1) + d.r * np.linalg.norm(d.w, axis=-1)
     position, velocity, spin = device(d, d.r[:, None] * np.array([0, 0, 1]), level, d.w)
     states = BallState(position, velocity, spin)
-    scenes = jax.vmap(ball_scene)(*device(d, d.m, d.r, d.j, d.mu))
-    slips = np.asarray(jax.vmap(lambda scene, state: slip(scene, state, "floor"))(scenes, states), d.r.dtype)
+    scenes = ball_scenes(*device(d, d.m, d.r, d.j, d.mu))
+    slips = np.asarray(slips_at_floor(scenes, states), d.r.dtype)
     both = np.stack([wall[:, 0], wall[:, 1], wall[:, 2] / d.r, floor[:, 1]], -1)
     own = np.array(rolls(d, d.v[:, 0], d.v[:, 1], d.w[:, 2]))
     own = np.asarray(own, d.dtype).astype(own.dtype)
@@ -239,9 +241,12 @@ def ball_scene(m, r, j, mu) -> Scene:
     return Scene(ball, {"floor": Plane((0, 0, 0), (0, 0, 1), Rough(mu))}, gravity=(0.0, 0.0, 0.0))
 
 
+ball_scenes = jax.jit(jax.vmap(ball_scene))
+
+
 def by_the_ball_engine(d: Draw, mu: np.ndarray):
     """One impact of every ball, by `simulate_batch` over scenes and states: they start in touch, and approach."""
-    scenes = jax.vmap(ball_scene)(*device(d, d.m, d.r, d.j, mu))
+    scenes = ball_scenes(*device(d, d.m, d.r, d.j, mu))
     v = np.concatenate([d.v[:, :2], -np.abs(d.v[:, 2:])], -1)
     states = BallState(*device(d, d.r[:, None] * np.array([0, 0, 1]), v, d.w))
     log = simulate_batch(scenes, states, t1=1.0, scene_axes=0, max_impacts=1).impacts
@@ -263,7 +268,7 @@ def balls(d: Draw) -> list[Check]:
     lost = np.concatenate([after.velocity, after.spin], -1)
     scenes, point, before, after, falling = by_the_ball_engine(d, np.ones_like(d.mu))
     kept = np.concatenate([after.velocity, after.spin], -1)
-    momenta = [jax.vmap(momentum_about)(point, scenes, state) for state in (before, after)]
+    momenta = [momenta_about(point, scenes, state) for state in (before, after)]
     size = d.r * d.m * np.linalg.norm(d.v, axis=-1) + d.j * np.linalg.norm(d.w, axis=-1)
     turned = np.linalg.norm(np.asarray(momenta[1] - momenta[0], size.dtype), axis=-1)
     drift = np.max(np.abs(product(a, rolled)), -1)

@@ -24,10 +24,10 @@ def by_the_ball_engine(bounces: int) -> Trajectory:
     return simulate(SCENE, start, t1=PERIOD / 2 * (bounces + 0.5), max_impacts=bounces + 1)
 
 
-def by_the_lagrangian(bounces: int) -> Trajectory:
+def by_the_lagrangian(bounces: int, max_impacts: int) -> Trajectory:
     start = ([0.0, 0.0, R, 1.0, 0.0, 0.0, 0.0], [V, 0.0, U, 0.0, -SPIN, 0.0])
     motion = Integrated(rtol=1e-12, atol=1e-12, max_steps=40_000)
-    return simulate(thrown_ball(), start, t1=PERIOD / 2 * (bounces + 0.5), motion=motion, max_impacts=bounces + 1)
+    return simulate(thrown_ball(), start, t1=PERIOD / 2 * (bounces + 0.5), motion=motion, max_impacts=max_impacts)
 
 
 def strayed(trajectory: Trajectory) -> np.ndarray:
@@ -52,7 +52,7 @@ def strayed(trajectory: Trajectory) -> np.ndarray:
 
 def checks(bounces: int = 1000, fewer: int = 100) -> list[Check]:
     """The engine through `bounces`, the LagrangianSystem through `fewer`."""
-    many, few = by_the_ball_engine(bounces), by_the_lagrangian(fewer)
+    many, few = by_the_ball_engine(bounces), by_the_lagrangian(fewer, fewer + 1)
     n, log = int(many.n_impacts), many.impacts
     both = [np.concatenate([s.velocity, R * s.spin], axis=1)[:n] for s in (log.before, log.after)]
     times = np.abs(np.asarray(log.time)[:n] - PERIOD / 2 * np.arange(1, n + 1)) / PERIOD
@@ -65,12 +65,12 @@ def checks(bounces: int = 1000, fewer: int = 100) -> list[Check]:
         Check("ball engine: energy", abs(e[1] / e[0] - 1), 1e-12),
         Check(f"LagrangianSystem: strayed in {int(few.n_impacts)} bounces", float(np.max(strayed(few))), 1e-9),
         Check("LagrangianSystem: bounces missing", fewer - int(few.n_impacts), 0),
-        *residuals(thrown_ball(), by_the_lagrangian(3)),
+        *residuals(thrown_ball(), by_the_lagrangian(3, fewer + 1)),
     ]
 
 
 def picture(bounces: int = 1000, fewer: int = 100) -> None:
-    many, few = by_the_ball_engine(bounces), by_the_lagrangian(fewer)
+    many, few = by_the_ball_engine(bounces), by_the_lagrangian(fewer, fewer + 1)
     new, (left, right) = figure(7.2, 3.0, 1, 2, width_ratios=[1, 1.1])
     path = np.asarray(many.at(jnp.linspace(0.0, PERIOD / 2, 60)).position)
     last = np.asarray(many.at(jnp.linspace(PERIOD / 2 * (bounces - 1), PERIOD / 2 * bounces, 12)).position)

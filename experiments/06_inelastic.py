@@ -51,12 +51,13 @@ def checks(n: int = 101) -> list[Check]:
     mu, before = np.linspace(0.0, 1.0, n), np.concatenate([VELOCITY, SPIN])
     rows = np.asarray(thrown_ball().barriers[0].constraint(jnp.zeros(7)))
     want = section_6(mu)
-    by_b = jax.vmap(lambda mu: collide(jnp.asarray(before), jnp.asarray(METRIC), jnp.asarray(rows), mu))(mu)
+    hit = lambda mu: collide(jnp.asarray(before), jnp.asarray(METRIC), jnp.asarray(rows), mu)  # noqa: E731
+    by_b = jax.jit(jax.vmap(hit))(mu)
     log = simulate_batch(
         jax.vmap(scene)(jnp.asarray(mu)), throw(n), t1=1.0, scene_axes=0, max_impacts=1, sum_trains=False
     ).impacts
     engine = np.concatenate([log.after.velocity[:, 0], log.after.spin[:, 0]], axis=-1)
-    across = np.asarray(projector(jnp.asarray(METRIC), jnp.asarray(rows)) @ before)
+    across = np.asarray(jax.jit(projector)(jnp.asarray(METRIC), jnp.asarray(rows))) @ before
     lost = 0.5 * (size(before) ** 2 - size(engine) ** 2)
     theory = 0.5 * (1 - mu**2) * size(across) ** 2  # from (6.1): only v_perp shrinks
     momentum = lambda v: R * M * np.stack([-v[..., 1], v[..., 0]], -1) + J * v[..., 3:5]  # noqa: E731

@@ -3,6 +3,7 @@ equal balls head-on without spin exchange their velocities.
 
 Picture: the paths of the two and of their centre of mass, and what passes from one to the other."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,11 +26,9 @@ def collide_them(system: LagrangianSystem, start: tuple) -> Trajectory:
     return simulate(system, start, t1=1.2, motion=FINE, max_impacts=2)
 
 
-@jax.jit
-def outcome(mu, other, q, v):
-    """Final state and number of impacts: one program for all masses and restitutions."""
-    trajectory = collide_them(two_balls(mu, other), (q, v))
-    return trajectory.final, trajectory.n_impacts
+@eqx.filter_jit
+def energy(system: LagrangianSystem, q, v):
+    return system.energy(q, v)
 
 
 def momenta(state: tuple, other: float) -> tuple[np.ndarray, np.ndarray]:
@@ -46,14 +45,15 @@ def relative(a: np.ndarray, b: np.ndarray) -> float:
 
 def checks(ratios=(1.0, 2.5, 100.0), restitutions=(1.0, 0.6)) -> list[Check]:
     rows = []
-    arrays = lambda state: tuple(jnp.asarray(x, dtype=float) for x in state)  # noqa: E731
+    start, head_on = (tuple(jnp.asarray(x, dtype=float) for x in state) for state in (OUT_OF_PLANE, HEAD_ON))
     for other in ratios:
         for mu in restitutions:
-            system = two_balls(mu, other)
-            final, n = outcome(jnp.asarray(mu), jnp.asarray(other), *arrays(OUT_OF_PLANE))
+            system = two_balls(jnp.asarray(mu), other)  # an array: one program for all restitutions
+            trajectory = collide_them(system, start)
+            final, n = trajectory.final, trajectory.n_impacts
             pairs = zip(momenta(final, other), momenta(OUT_OF_PLANE, other), strict=True)
             changes = [relative(a, b) for a, b in pairs]
-            gain = float(system.energy(*final) / system.energy(*OUT_OF_PLANE)) - 1
+            gain = float(energy(system, *final) / energy(system, *start)) - 1
             name = f"masses 1 : {other:g}, mu = {mu:g}"
             rows += [
                 Check(f"{name}: impacts", int(n), 0, above=True),
@@ -64,10 +64,9 @@ def checks(ratios=(1.0, 2.5, 100.0), restitutions=(1.0, 0.6)) -> list[Check]:
                 rows.append(Check(f"{name}: energy, change", abs(gain), 1e-12))
             else:
                 rows.append(Check(f"{name}: energy, gain", gain, -1e-3))
-    system = two_balls(restitutions[-1], ratios[-1])
-    rows += [row._replace(what=f"{name}: {row.what}") for row in residuals(system, collide_them(system, OUT_OF_PLANE))]
-    final, _ = outcome(jnp.asarray(1.0), jnp.asarray(1.0), *arrays(HEAD_ON))
-    after = np.asarray(final[1])
+    system = two_balls(jnp.asarray(restitutions[-1]), ratios[-1])
+    rows += [row._replace(what=f"{name}: {row.what}") for row in residuals(system, collide_them(system, start))]
+    after = np.asarray(collide_them(two_balls(jnp.asarray(1.0)), head_on).final[1])
     return [*rows, Check("equal, head-on, no spin: exchange", relative(after, np.roll(HEAD_ON[1], 6)), 1e-13)]
 
 
