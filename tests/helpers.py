@@ -246,10 +246,10 @@ def arrays(numbers: dict, dtype=np.float64) -> dict:
 
 
 def scene_of(case: SurfaceCase, law, *, ball=None, numbers=None, gravity=GRAVITY, air=None) -> Scene:
-    """A scene with one surface. Numbers default to the constants of this file."""
+    """A scene with one surface, `it`. Numbers default to the constants of this file."""
     surface = case.build(law=law, **(case.numbers if numbers is None else numbers))
     return Scene(
-        Ball(**(BALL if ball is None else ball)), {case.name: surface}, gravity, None if air is None else Air(**air)
+        Ball(**(BALL if ball is None else ball)), {"it": surface}, gravity, None if air is None else Air(**air)
     )
 
 

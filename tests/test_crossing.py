@@ -322,14 +322,16 @@ def test_box_against_faces_edges_and_corners(getkey):
 # Touching, and long times
 
 
+def scene_of_arrays(case, dtype):
+    return scene_of(case, Rough(jnp.asarray(0.9, dtype)), ball=arrays(BALL, dtype), numbers=arrays(case.numbers, dtype))
+
+
 @dtypes
 @pytest.mark.parametrize("case", **named(all_surfaces))
 def test_touching_and_approaching_bounces_at_once_and_leaving_does_not(case, dtype, getkey):
     """From the place of a first impact: on with the velocity before it, on with the one after it."""
     throw = throws(case, getkey(), 32, dtype=dtype)
-    scene = scene_of(
-        case, Rough(jnp.asarray(0.9, dtype)), ball=arrays(BALL, dtype), numbers=arrays(case.numbers, dtype)
-    )
+    scene = scene_of_arrays(case, dtype)
     first = simulate_batch(scene, throw, t1=0.5, max_impacts=1, sum_trains=False)
     assert np.all(first.n_impacts == 1)
     before, after = lane((first.impacts.before, first.impacts.after), (slice(None), 0))
@@ -382,17 +384,15 @@ def test_one_slow_flight_of_a_thousand_seconds_inside_a_sphere():
 def test_gap_level_and_normal_belong_together(case, getkey):
     """The level has the zeros of the gap and its slope there; the normal is the gap's gradient."""
     throw = throws(case, getkey(), 32)
-    scene = scene_of(case, Rough(0.9))
-    surface = scene.surfaces[0]
-    at = simulate_batch(scene, throw, t1=0.5, max_impacts=1, sum_trains=False).impacts.before.position[:, 0]
-    radius = BALL["radius"]
-    gap = lambda x: surface.gap(x, 0.0, radius)  # noqa: E731
-    level = lambda x: surface.level(tuple(x), 0.0, radius)  # noqa: E731
-    normal = jax.vmap(lambda x: surface.normal(x, 0.0))(at)
+    first = simulate_batch(scene_of_arrays(case, np.float64), throw, t1=0.5, max_impacts=1, sum_trains=False)
+    surface, radius = scene_of(case, Rough(0.9)).surfaces[0], BALL["radius"]
+    gap = jax.value_and_grad(lambda x: surface.gap(x, 0.0, radius))
+    level = jax.value_and_grad(lambda x: surface.level(tuple(x), 0.0, radius))
+    look = jax.jit(jax.vmap(lambda x: (*gap(x), *level(x), surface.normal(x, 0.0))))
+    gaps, slope, levels, steep, normal = (np.asarray(x) for x in look(first.impacts.before.position[:, 0]))
     implicit = case.name == "implicit"  # its gap is no distance: only directions agree
-    slope = np.asarray(jax.vmap(jax.grad(gap))(at))
     length = np.linalg.norm(slope, axis=1, keepdims=True)
-    assert np.abs(jax.vmap(gap)(at)).max() < 1e-14 and np.abs(jax.vmap(level)(at)).max() < 1e-14
+    assert np.abs(gaps).max() < 1e-14 and np.abs(levels).max() < 1e-14
     assert implicit or np.abs(length - 1).max() < 1e-13
     np.testing.assert_allclose(normal, slope / length, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(jax.vmap(jax.grad(level))(at), slope, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(steep, slope, rtol=0, atol=1e-12)
