@@ -79,7 +79,14 @@ def outputs(trajectory):
 
 
 def one_motion(case, motion, adjoint=None):
-    """(numbers flattened, index of the law) -> outputs, and how to unflatten."""
+    """(numbers flattened, index of the law) -> outputs, and how to unflatten. The same function for surfaces that
+    differ in their numbers only."""
+    return _one_motion(next(i for i, each in enumerate(all_surfaces) if each.build is case.build), motion, adjoint)
+
+
+@functools.cache
+def _one_motion(number, motion, adjoint):
+    case = all_surfaces[number]
     air = not isinstance(motion, Exact)
     example = all_numbers(case, lane(throws(case, jax.random.key(0), 1), 0))
     unravel = ravel_pytree(example)[1]
@@ -101,8 +108,15 @@ def batch_of(case, key, dtype=np.float64):
 
 
 def both_modes(function, flat, index):
-    """Jacobians (lanes, outputs, numbers) in forward and reverse mode, in one program that finds the path once; and
-    number, first state and first time of the impacts."""
+    """Jacobians (lanes, outputs, numbers) in forward and reverse mode, and number, first state and first time of the
+    impacts."""
+    forward, reverse, trajectory = _both_modes(function)(flat, index)
+    return np.asarray(forward), np.asarray(reverse), trajectory
+
+
+@functools.cache
+def _both_modes(function):
+    """One program, that finds the path once."""
 
     @fast_jit
     @jax.vmap
@@ -117,19 +131,25 @@ def both_modes(function, flat, index):
         forward = jax.vmap(along, out_axes=-1)(jnp.eye(x.size))
         return forward, jax.vmap(lambda cotangent: pullback(cotangent)[0])(jnp.eye(out.size)), trajectory
 
-    forward, reverse, trajectory = run(flat, index)
-    return np.asarray(forward), np.asarray(reverse), trajectory
+    return run
 
 
 def differences(function, flat, index, step):
     """Central differences of fourth order, (lanes, outputs, numbers), and for each lane and number whether all points
     of them are made of the same number of impacts and steps: the discrete map jumps where a step more is taken."""
     steps = step * np.maximum(np.abs(np.asarray(flat)), 0.1)  # (lanes, numbers)
-    shifts = jnp.asarray(np.array([-2, -1, 1, 2])[:, None, None] * np.eye(flat.shape[1]))
+    slopes, same = _around(function)(flat, jnp.asarray(steps), index)
+    assert np.mean(same) > 0.9
+    return np.asarray(slopes), np.asarray(same)
 
+
+@functools.cache
+def _around(function):
     @fast_jit
     @jax.vmap
     def around(x, h, i):
+        shifts = jnp.asarray(np.array([-2, -1, 1, 2])[:, None, None] * np.eye(x.size))
+
         def one(d):
             trajectory = function(x + d * h, i)
             return outputs(trajectory), jnp.stack([trajectory.n_impacts, trajectory.n_arcs])
@@ -138,9 +158,7 @@ def differences(function, flat, index, step):
         slopes = jnp.einsum("s,spo->op", jnp.array([1, -8, 8, -1]) / 12, end) / h[None]
         return slopes, jnp.all(counts == counts[:1], axis=(0, 2))
 
-    slopes, same = around(flat, jnp.asarray(steps), index)
-    assert np.mean(same) > 0.9
-    return np.asarray(slopes), np.asarray(same)
+    return around
 
 
 def check_differences(jacobian, differences, tolerance):
