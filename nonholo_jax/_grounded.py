@@ -18,11 +18,12 @@ from ._rotation import rolled
 from ._round import round_bend, round_level
 from ._scene import Flight, Scene
 from ._surface import Face
-from ._system import AbstractSystem, bounces
+from ._system import AbstractSystem, bounces, rounding
 from ._types import KINDS, RESULTS, Number, Vector3
 from ._vector import (
     add,
     components,
+    cross,
     dot,
     minimum,
     norm,
@@ -323,7 +324,7 @@ class Grounded(AbstractSystem):
         over = KINDS.where(grips, KINDS.gripped, KINDS.left)
         kind = KINDS.where(on, KINDS.where(is_exit, over, wall), bounce_or_end)
 
-        stuck = ~is_exit & jnp.where(on, rests, ends & ~is_floor)
+        stuck = ~is_exit & jnp.where(on, rests & ~self._is_wedged(contact, time, state), ends & ~is_floor)
         fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
         fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
         fault = RESULTS.where(on & is_exit & ~grips & self._tips(contact, state, floor[0]), RESULTS.pivoting, fault)
@@ -366,6 +367,10 @@ class Grounded(AbstractSystem):
             velocity, spin = rolling.gripped(self.scene.ball, face.normal, flight.velocity, flight.spin)
             kept = kept._replace(velocity=_where(grips, velocity, kept.velocity), spin=_where(grips, spin, kept.spin))
 
+        wedged = self._is_wedged(contact, time, state)
+        kept = kept._replace(velocity=_where(wedged, rolling.NONE, kept.velocity),
+                             spin=_where(wedged, rolling.NONE, kept.spin))  # fmt: skip
+
         velocity = _where(left, flight.velocity, _where(stays, kept.velocity, struck.velocity))
         spin = _where(left, flight.spin, _where(stays, kept.spin, struck.spin))
         after = flight._replace(
@@ -389,6 +394,29 @@ class Grounded(AbstractSystem):
         velocity, spin = rolling.against_rough(ball, n, wall, mu, velocity, spin)
         return flight._replace(velocity=_where(smooth, turned, velocity), spin=_where(smooth, carried, spin))
 
+    def _held(self, contact: Any, time: Any, state: Travel) -> tuple[Number, Any]:
+        """The acceleration with which gravity holds a ball on its support against another surface, and whether it does
+        so: into that surface, and not along the groove between the two."""
+        x, surfaces = state.flight.position, self.scene.surfaces
+        face, _ = self._floors.face(state.support, x, time)
+        wall = select_vector(contact, [surface.direction(x, time) for surface in surfaces])
+        g, groove = components(self.scene.gravity), cross(face.normal, wall)
+        pull = times(-1.0, dot(wall, rolling.along_surface(face.normal, g)))
+        eps = float(jnp.finfo(jnp.result_type(*x)).eps)
+        held = (pull > 0) & (abs(dot(g, groove)) <= 64.0 * eps * norm(g)) & (self.scene.air is None)
+        return pull, held & (state.support >= 0) & (contact < len(surfaces))
+
+    def _is_wedged(self, contact: Any, time: Any, state: Travel) -> Any:
+        """Whether all that is left of the motion of a ball in a groove is impacts on a surface beside its support, from
+        which it moves off by less than rounding."""
+        flight, surfaces = state.flight, self.scene.surfaces
+        pull, held = self._held(contact, time, state)
+        wall = select_vector(contact, [surface.direction(flight.position, time) for surface in surfaces])
+        closing = dot(wall, flight.velocity)
+        tolerance = select(contact, [rounding(self, i, flight.position) for i in range(len(surfaces))])
+        creeps = norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin) <= 64.0 * abs(closing)
+        return held & self._stays(contact, state.support) & creeps & (closing * closing <= 4.0 * pull * tolerance)
+
     def during(self, contact, time, state, elapsed):
         """The state so long after the first impact of a train."""
         face, _ = self._floors.face(contact, state.flight.position, time)
@@ -411,9 +439,9 @@ class Grounded(AbstractSystem):
         size: Callable = lambda flight: norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)  # noqa: E731
         face, _ = self._floor(contact, time, before)
         g = components(self.scene.gravity)
-        along = rolling.along_surface(face.normal, g)
+        is_level = (norm(rolling.along_surface(face.normal, g)) <= 64.0 * eps * norm(g)) & (self.scene.air is None)
         still = size(after.flight) <= 64.0 * eps * size(before.flight)
-        return (after.support >= 0) & still & (norm(along) <= 64.0 * eps * norm(g)) & (self.scene.air is None)
+        return (after.support >= 0) & still & (is_level | self._held(contact, time, before)[1])
 
     # Users' states
 

@@ -103,6 +103,8 @@ class LagrangianSystem(AbstractSystem):
     - `forces`: `forces(q, v, t)`, shape (n,), that have no potential; their power is forces . v.
     - `retraction`: `retraction(q)`, which puts q back on its manifold after a step: a quaternion at unit length.
 
+    Functions are told apart by identity: a system built again from new lambdas is compiled again.
+
     Give the pair (q, v) to `simulate`, which gives pairs back. Raises `ValueError` for a Lagrangian and a metric, or
     neither; and `simulate` does, for shapes that do not fit, a velocity with A v != b (see `admissible`), a metric that
     is not positive definite, a frame that is not one, and a barrier whose ker B is not inside ker A. Where values are

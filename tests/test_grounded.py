@@ -304,6 +304,22 @@ def test_ball_flies_off_an_edge(table, motion):
         assert float(edge.position[0]) == pytest.approx(0.5, abs=1e-9)
 
 
+@pytest.mark.parametrize("wall", [Rough(0.5), Smooth(0.3), Rough(0.0)], ids=["rough", "smooth", "plastic"])
+def test_rolls_down_to_a_wall_and_comes_to_rest(wall):
+    """Ever lower rebounds from the wall, whose times are a geometric series; along the groove it would roll on."""
+    slope = {"floor": Plane(STILL, (0.2, 0.0, 1.0), Rough(0.5)), "wall": Plane((2.0, 0.0, 0.0), (-1.0, 0.0, 0.0), wall)}
+    state = BallState([0.0, 0.0, 0.3], STILL, STILL)
+    trajectory = simulate(Scene(BALL, slope), state, t1=9.0)
+    assert result_of(trajectory) == "at_rest"
+    first, mu = kinds(trajectory).index("rolling"), wall.restitution
+    speed, pull = np.linalg.norm(trajectory.impacts.before.velocity[first]), G * 0.2 / np.sqrt(1.04) / (1.0 + ALPHA)
+    rests = float(trajectory.impacts.time[first]) + 2.0 * mu * speed / (pull * (1.0 - mu))
+    np.testing.assert_allclose(float(trajectory.t1), rests, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(stacked(trajectory.final)[3:], 0.0, atol=1e-12)
+    moving = dataclasses.replace(state, velocity=jnp.asarray([0.0, 0.3, 0.0]))
+    assert result_of(simulate(Scene(BALL, slope), moving, t1=9.0, throw=False)) == "sustained_contact"
+
+
 def test_slow_ball_tips_by_name():
     """v^2 < g r at the edge: it would pivot."""
     scene = Scene(BALL, {"table": tables()["box"]})
