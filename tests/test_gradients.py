@@ -81,7 +81,8 @@ def outputs(trajectory):
 def one_motion(case, motion, adjoint=None):
     """(numbers flattened, index of the law) -> outputs, and how to unflatten. The same function for surfaces that
     differ in their numbers only."""
-    return _one_motion(next(i for i, each in enumerate(all_surfaces) if each.build is case.build), motion, adjoint)
+    alike = [each.build is case.build and each.numbers.keys() == case.numbers.keys() for each in all_surfaces]
+    return _one_motion(alike.index(True), motion, adjoint)
 
 
 @functools.cache
