@@ -59,6 +59,11 @@ def _where(condition: Any, a: Sequence[Number], b: Sequence[Number]) -> Any:
     return tuple(where_number(condition, x, y) for x, y in zip(a, b, strict=True))
 
 
+def _if_any(condition: Any, wanted: Callable, plain: Callable) -> Any:
+    """`wanted()` if a condition holds in any lane of a batch: otherwise `plain()`, which must be equal then."""
+    return lax.cond(eqxi.unvmap_any(condition), wanted, plain)
+
+
 class Grounded(AbstractSystem):
     """A scene with the motion after the last bounce. `tolerance` is the velocity in m/s that what has no sum may change
     during a train that is summed; `parabolic` says that arcs must be parabolas. Where a surface has a coefficient of
@@ -300,11 +305,7 @@ class Grounded(AbstractSystem):
         is_floor = self._floors.include(contact) & face.below & (first.pull > 0)
         soon = is_floor & ((train.duration(first, self._floors.law(contact).restitution) <= left) | rests)
         arguments = (contact, time, state, bounced, left, rests, ends)
-        return self._if_any((state.support >= 0) | soon, lambda: self._settling(*arguments), lambda: bounces(ends))
-
-    def _if_any(self, condition: Any, wanted: Callable, plain: Callable) -> Any:
-        """`wanted()` if a condition holds in any lane of a batch: otherwise `plain()`, which must be equal then."""
-        return lax.cond(eqxi.unvmap_any(condition), wanted, plain)
+        return _if_any((state.support >= 0) | soon, lambda: self._settling(*arguments), lambda: bounces(ends))
 
     def _settling(self, contact, time, state, bounced, left, rests, ends):
         on, struck = state.support >= 0, bounced.flight
@@ -346,7 +347,7 @@ class Grounded(AbstractSystem):
 
     def impact(self, contact, time, state, bounced, kind):
         as_arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=time.dtype), tree)  # noqa: E731
-        return self._if_any(
+        return _if_any(
             (state.support >= 0) | (kind != KINDS.bounce),
             lambda: as_arrays(self._settled(contact, time, state, bounced, kind)),
             lambda: as_arrays((Travel(bounced.flight, -1.0), 0.0)),
@@ -385,7 +386,7 @@ class Grounded(AbstractSystem):
     def _against(self, contact: Any, time: Any, flight: Flight, support: Any, n: Vector3) -> Flight:
         """A ball that stays on its support hits another surface; where there is friction it may slip afterwards."""
         ball, surfaces, velocity, spin = self.scene.ball, self.scene.surfaces, flight.velocity, flight.spin
-        wall = select_vector(contact, [surface.direction(flight.position, time) for surface in surfaces])
+        wall = self._normal(contact, time, flight.position)
         mu = select(contact, [surface.law.restitution for surface in surfaces])
         smooth = jnp.asarray(select(contact, [float(surface.law.rolls is False) for surface in surfaces])) > 0.5
         turned = rolling.against_smooth(n, wall, mu, velocity)
@@ -394,12 +395,16 @@ class Grounded(AbstractSystem):
         velocity, spin = rolling.against_rough(ball, n, wall, mu, velocity, spin)
         return flight._replace(velocity=_where(smooth, turned, velocity), spin=_where(smooth, carried, spin))
 
+    def _normal(self, contact: Any, time: Any, x: Vector3) -> Vector3:
+        """The normal at a place of the surface of that index."""
+        return select_vector(contact, [surface.direction(x, time) for surface in self.scene.surfaces])
+
     def _held(self, contact: Any, time: Any, state: Travel) -> tuple[Number, Any]:
         """The acceleration with which gravity holds a ball on its support against another surface, and whether it does
         so: into that surface, and not along the groove between the two."""
         x, surfaces = state.flight.position, self.scene.surfaces
         face, _ = self._floors.face(state.support, x, time)
-        wall = select_vector(contact, [surface.direction(x, time) for surface in surfaces])
+        wall = self._normal(contact, time, x)
         g, groove = components(self.scene.gravity), cross(face.normal, wall)
         pull = times(-1.0, dot(wall, rolling.along_surface(face.normal, g)))
         eps = float(jnp.finfo(jnp.result_type(*x)).eps)
@@ -411,8 +416,7 @@ class Grounded(AbstractSystem):
         which it moves off by less than rounding."""
         flight, surfaces = state.flight, self.scene.surfaces
         pull, held = self._held(contact, time, state)
-        wall = select_vector(contact, [surface.direction(flight.position, time) for surface in surfaces])
-        closing = dot(wall, flight.velocity)
+        closing = dot(self._normal(contact, time, flight.position), flight.velocity)
         tolerance = select(contact, [rounding(self, i, flight.position) for i in range(len(surfaces))])
         creeps = norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin) <= 64.0 * abs(closing)
         return held & self._stays(contact, state.support) & creeps & (closing * closing <= 4.0 * pull * tolerance)

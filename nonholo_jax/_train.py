@@ -101,7 +101,7 @@ def slips_throughout(first: Start, contact: Contact, tolerance: float) -> Any:
     helped = ratio(dot(first.slip, first.along), speed)  # by gravity
     sideways = norm(subtract(first.along, scale(ratio(helped, speed), first.slip)))
     taken, lasts = _taken(first, contact), _lasts(first, contact)
-    last = speed + helped * lasts - taken * ratio(1.0, 1.0 - contact.restitution)
+    last = speed + helped * lasts - ratio(taken, 1.0 - contact.restitution)
     flight = ratio(times(2.0, first.rise), first.pull)
     begins = (1.0 + contact.reversal) * (speed + helped * flight) >= taken
     eps = float(jnp.finfo(jnp.result_type(*first.velocity)).eps)
@@ -131,6 +131,7 @@ def _taken(first: Start, contact: Contact) -> Number:
 
 
 def _lasts(first: Start, contact: Contact) -> Number:
+    """`duration`, but a harmless number where the bounces do not end."""
     return ratio(times(2.0, first.rise), times(first.pull, 1.0 - contact.restitution))
 
 

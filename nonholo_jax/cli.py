@@ -123,8 +123,8 @@ def _run(options: argparse.Namespace, from_start: bool) -> int:
 
 
 def _compile_fast() -> None:
-    """Ask JAX 0.10 for XLA's older code generator on the CPU: compilation takes two thirds of the time, and one motion
-    runs as fast. Other versions may not know that flag, and XLA stops at a flag that it does not know."""
+    """Ask JAX 0.10 for XLA's older code generator on the CPU: compilation takes three quarters of the time, and one
+    motion runs as fast. Other versions may not know that flag, and XLA stops at a flag that it does not know."""
     flag = "--xla_cpu_use_fusion_emitters="
     chosen = os.environ.get("XLA_FLAGS", "")
     if metadata.version("jaxlib").startswith("0.10.") and flag not in chosen:
@@ -245,7 +245,7 @@ def _motion(scene: Any, trajectory: Any) -> dict[str, Any]:
     import jax
     import numpy as np
 
-    from ._types import NO_IMPACTS, kind_name
+    from ._types import kind_name, surfaces_hit
 
     log = jax.tree.map(np.asarray, trajectory.impacts)
     impacts = []
@@ -266,7 +266,7 @@ def _motion(scene: Any, trajectory: Any) -> dict[str, Any]:
         )
     final, initial = _state(trajectory.final), _state(trajectory.initial)
     return {
-        "itinerary": [impact["surface"] for impact in impacts if impact["kind"] not in NO_IMPACTS],
+        "itinerary": list(surfaces_hit(scene.names, log)),
         "impacts": impacts,
         "final": final,
         "time": float(trajectory.t1),
