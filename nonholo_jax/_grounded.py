@@ -447,6 +447,25 @@ class Grounded(AbstractSystem):
         still = size(after.flight) <= 64.0 * eps * size(before.flight)
         return (after.support >= 0) & still & (is_level | self._held(contact, time, before)[1])
 
+    # Where nothing settles
+
+    def can_hop(self, state):
+        return self.scene.can_hop(state.flight) and not self._floors.have_edges
+
+    def hop(self, touching, going, full, left, state):
+        laws = {i: self.scene.surfaces[i].law for i in self._floors.indices}
+        normals = [surface.direction(state.flight.position, 0.0) for surface in self.scene.surfaces]
+
+        def dies_out(i, speed, left):
+            """`train.duration` is at most `left`, or nearly, without its divisions."""
+            if i not in laws:
+                return None
+            e, pull = laws[i].restitution, times(-1.0, dot(normals[i], components(self.scene.gravity)))
+            return jnp.asarray(pull > 0) & (times(2.0 * e, speed) <= 1.001 * left * times(pull, 1.0 - e))
+
+        done = self.scene.hop(touching, going, full, left, state.flight, dies_out)
+        return done._replace(state=Travel(done.state, state.support))
+
     # Users' states
 
     def is_admissible(self, time, state):

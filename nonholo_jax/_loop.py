@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ._hops import ENDS, FULL
 from ._crossing import corrected, meeting, newton, search
 from ._motion import AbstractMotion
 from ._shared import shared
@@ -24,6 +25,7 @@ from ._types import KINDS, RESULTS
 from ._vector import frozen, norm
 
 _CHUNK = 16
+_HOP_TILE = 1024
 _MOST_IMPACTS_AT_ONCE = 32
 
 
@@ -267,12 +269,72 @@ def _tiny(arc: Any, s: Any) -> Any:
     return 64.0 * eps * frozen(norm(arc.position(s)))
 
 
+class _Hopping(NamedTuple):
+    """A carry without what only a search needs."""
+
+    time: Any
+    state: Any
+    mark: Any  # the contact just left, or -1; once it has stopped, when and why, as `_stopped` has it
+    turn: Any
+
+
+def _stopped(turn: Any, touching: Any, why: Any, bits: int) -> Any:
+    """A mark below -1 from the number of impacts, the contact last touched and the reason, 0 to 2."""
+    return ~((((turn << bits) | (touching + 1)) << 2 | why) + 1)
+
+
+def _unmarked(mark: Any, bits: int) -> tuple:
+    known = ~mark - 1
+    return known >> (bits + 2), ((known >> 2) & ((1 << bits) - 1)) - 1, known & 3
+
+
+def _hopped(carry: _Carry, system: AbstractSystem, t1: Any, max_impacts: int) -> _Carry:
+    """The motion as far as it is a row of ordinary impacts, known in closed form. All lanes that hop are at the same
+    impact, so that the number of turns counts their impacts."""
+
+    bits = system.n_contacts.bit_length()
+
+    def turn(c: _Hopping) -> _Hopping:
+        going = c.mark >= -1
+        hop = system.hop(c.mark, going, c.turn >= max_impacts, t1 - c.time, c.state)
+        why = jnp.where(hop.choice == ENDS, 0, jnp.where(hop.choice == FULL, 1, 2))
+        stop = _stopped(c.turn, jnp.maximum(c.mark, -1), why, bits)
+        mark = jnp.where(hop.choice >= 0, hop.choice.astype(jnp.int32), jnp.where(going, stop, c.mark))
+        return _Hopping(c.time + hop.duration, hop.state, mark, c.turn + 1)
+
+    zero = jnp.asarray(0, dtype=jnp.int32)
+    none = _stopped(zero, -1, 2, bits)
+    start = _Hopping(carry.time, carry.state, jnp.where(carry.done, none, carry.touching), zero)
+    end = lax.while_loop(lambda c: eqxi.unvmap_any(c.mark >= -1), turn, start)
+    n_impacts, touching, why = _unmarked(end.mark, bits)
+    reached, full = (why == 0) & ~carry.done, (why == 1) & ~carry.done
+    return carry._replace(
+        time=jnp.where(reached, t1, end.time),
+        state=end.state,
+        touching=touching,
+        jumped=carry.jumped | (n_impacts > 0),
+        n_impacts=n_impacts,
+        n_arcs=n_impacts + (reached | full).astype(jnp.int32),
+        done=carry.done | reached | full,
+        result=RESULTS.where(full, RESULTS.max_impacts, carry.result),
+    )
+
+
+def _can_hop(system: AbstractSystem, motion: AbstractMotion, state: Any, max_impacts: int) -> bool:
+    few = (max_impacts + 2) << (system.n_contacts.bit_length() + 2) < 2**31
+    return motion.is_closed_form and few and system.can_hop(state)
+
+
 def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, path_rows: int, kind: Any = "lax"):
     """Run the loop; returns the outcome and the path. `kind` chooses how the loop itself may be differentiated."""
     carry = _start(system, motion, state, t0, t1, log_rows, path_rows)
     turn = lambda c: _turn(c, system, motion, t1, max_impacts)  # noqa: E731
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
-    if kind == "lax":
+    if kind == "hop":
+        carry = _hopped(carry, system, t1, max_impacts)
+        rest = in_tiles(lambda system, motion, t1, carry: lax.while_loop(going, lambda c: _turn(c, system, motion, t1, max_impacts), carry), motion.tile)
+        end = lax.cond(eqxi.unvmap_any(~carry.done), lambda c: rest(system, motion, t1, c), lambda c: c, carry)
+    elif kind == "lax":
         end = lax.while_loop(going, turn, carry)
     else:
         end = eqxi.while_loop(going, turn, carry, kind=kind, max_steps=motion.max_turns(max_impacts))
@@ -354,7 +416,23 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
 
 def _find(system, motion, state, t0, t1, **options):
     """`find`, not differentiated, and in tiles where it is batched."""
-    return in_tiles(lambda *primals: find(*primals, **options), motion.tile)(*frozen((system, motion, state, t0, t1)))
+    primals = frozen((system, motion, state, t0, t1))
+    if options["log_rows"] == options["path_rows"] == 0 and _can_hop(system, motion, state, options["max_impacts"]):
+        return _find_by_hops(*primals, **options)
+    return in_tiles(lambda *primals: find(*primals, **options), motion.tile)(*primals)
+
+
+def _find_by_hops(system, motion, state, t0, t1, **options):
+    """The same. Hops are so quick that reading and writing counts: what passes into a tile and out of it is the user's
+    form of a state, few arrays instead of many."""
+
+    def part(system, motion, user, phase, t0, t1):
+        outcome, path = find(system, motion, system.unpacked(user, phase), t0, t1, kind="hop", **options)
+        return outcome._replace(state=(system.packed(outcome.state), system.phase(outcome.state))), path
+
+    given = (system, motion, system.packed(_arrays(state, t0.dtype)), system.phase(state), t0, t1)
+    outcome, path = in_tiles(part, _HOP_TILE)(*given)
+    return outcome._replace(state=system.unpacked(*outcome.state)), path
 
 
 @eqx.filter_custom_jvp

@@ -1,6 +1,7 @@
 """A scene: one ball, named surfaces, gravity and perhaps air."""
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -12,10 +13,11 @@ from jax import lax
 from ._air import Air
 from ._ball import Ball, BallState, check_ball_state
 from ._corner import collide_with_all, is_one_mu
+from ._hops import Hop, Wall, hop
 from ._polynomial import Window
 from ._rotation import turned
 from ._shared import shared
-from ._surface import AbstractSurface
+from ._surface import AbstractSurface, Plane
 from ._system import AbstractSystem, bounces, rounding
 from ._types import Vector3
 from ._vector import (
@@ -173,20 +175,48 @@ class Scene(AbstractSystem):
         return known & ((contact == other) | (touches & closes & jnp.asarray(surface.law.restitution == mu)))
 
     def _single_impact(self, contact, time, state):
-        ball, x = self.ball, state.position
-        n = shared(select_vector(contact, [surface.direction(x, time) for surface in self.surfaces]))
+        n = shared(select_vector(contact, [surface.direction(state.position, time) for surface in self.surfaces]))
+        velocity, spin = self._after(contact, n, state.velocity, state.spin)
+        return Flight(state.position, velocity, spin, state.orientation)
+
+    def _after(self, contact: Any, n: Vector3, velocity: Vector3, spin: Vector3, shared: Callable = shared) -> Any:
+        """Velocity and spin after an impact on one surface, with the normal there."""
+        ball = self.ball
         e_n = select(contact, [surface.law.restitution for surface in self.surfaces])
-        closing = dot(n, state.velocity)
-        contact_velocity = subtract(state.velocity, scale(ball.radius, cross(state.spin, n)))
-        slip = subtract(contact_velocity, scale(closing, n))
+        closing = dot(n, velocity)
+        slip = subtract(subtract(velocity, scale(ball.radius, cross(spin, n))), scale(closing, n))
         closing, *slip = shared([closing, *slip])
         sizes = (ball.inertia_ratio, abs(closing), dot(slip, slip))
         s = select(contact, [surface.law.slip_factor(*sizes) for surface in self.surfaces])
         s, rebound = shared([s, times(plus(1.0, e_n), closing)])
         kick = add(scale(rebound, n), scale(s, slip))
         twist = times(s, ratio(1.0, times(ball.inertia_ratio, ball.radius)))
-        spin = add(state.spin, scale(twist, cross(n, tuple(slip))))
-        return Flight(x, subtract(state.velocity, kick), spin, state.orientation)
+        return subtract(velocity, kick), add(spin, scale(twist, cross(n, tuple(slip))))
+
+    def can_hop(self, state):
+        flat = len(self.surfaces) > 0 and all(type(surface) is Plane for surface in self.surfaces)
+        return flat and self.air is None and state.orientation is None
+
+    def hop(self, touching, going, full, left, state, dies_out=None):
+        """A parabola from plane to plane; `dies_out(i, speed, left)` says whether bounces may end after an impact."""
+        g, x = components(self.gravity), state.position
+        walls, floor = [], (0.0, 0.0, 0.0)
+        for i, surface in enumerate(self.surfaces):
+            n = surface.direction(x, 0.0)
+            noise = rounding(self, i, x)
+            walls.append(Wall(n, self.level(i, 0.0, x, state), dot(n, state.velocity), times(0.5, dot(n, g)), noise))
+
+        def room(i, j):
+            levels = [self.level(k, 0.0, floor, state) for k in (i, j)]
+            return ratio(plus(*levels), plus(abs(levels[0]), plus(abs(levels[1]), self.ball.radius)))
+
+        def kicked(choice, velocity, spin):
+            n = select_vector(choice, [wall.normal for wall in walls])
+            return self._after(choice, n, velocity, spin, lambda x: (x[0], *shared(x[1:])) if len(x) > 2 else x)
+
+        parts = (touching, going, full, left, (x, state.velocity, state.spin))
+        done = hop(walls, room, g, kicked, dies_out or (lambda *_: None), *parts)
+        return done._replace(state=Flight(*done.state, None))
 
     def level(self, contact, time, q, state):
         return self.surfaces[contact].level(q, time, self.ball.radius)
@@ -217,7 +247,7 @@ class Scene(AbstractSystem):
             holds += [jnp.asarray(check) for check, _ in checks]
             depth = self.level(i, time, state.position, state) + 16.0 * rounding(self, i, state.position)
             holds.append(jnp.asarray(depth >= 0))
-        return jnp.all(jnp.stack(holds))
+        return functools.reduce(jnp.logical_and, holds)
 
     def received(self, state, batch, t0):
         check_ball_state(state, batch)

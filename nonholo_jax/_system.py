@@ -119,6 +119,16 @@ class AbstractSystem(eqx.Module):
     def contact_frame(self, contact: Index, time: Scalar, state: Any) -> tuple[Array, Array]:
         """The point of contact and the gradient of the gap there."""
 
+    def can_hop(self, state: Any) -> bool:
+        """Whether the next impact is known in closed form, so that `hop` serves until something unusual happens."""
+        del state
+        return False
+
+    def hop(self, touching: Any, going: Any, full: Any, left: Scalar, state: Any) -> Any:
+        """One arc and the impact that ends it, or, where not `going`, nothing: a `Hop`. `touching` is the contact that
+        was left last, `full` says that there may be no further impact, `left` how many seconds are left."""
+        raise NotImplementedError
+
     @abstractmethod
     def without_contacts(self) -> "AbstractSystem":
         """The same system with nothing to hit."""

@@ -1,0 +1,108 @@
+"""Parabolas from plane to plane, each with the impact that ends it, in few passes over a batch.
+
+Between planes the next impact is the root of a quadratic, and needs no search. A hop does only what an ordinary bounce
+needs; where there may be more to do (a corner, grazing, bounces that die out, a number that is not finite) it says so,
+and the event loop goes on from there.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from ._shared import shared
+from ._types import Number, Vector3
+from ._vector import add, is_constant, scale, times
+
+
+class Hop(NamedTuple):
+    """A parabola and the impact at its end."""
+
+    duration: Any  # in s; 0 for what cannot hop
+    choice: Any  # a float: the plane that was hit, or one of the codes below
+    state: Any  # afterwards
+
+
+ENDS, FULL, PAUSES = -1.0, -2.0, -3.0  # the time is over; one impact too many, before which it stops; cannot hop
+
+
+class Wall(NamedTuple):
+    """A plane as a hop sees it, with what the ball's centre does towards it."""
+
+    normal: Vector3
+    gap: Any
+    rate: Any
+    pull: Number  # half the acceleration of the gap
+    noise: Number  # a distance well above the rounding of the gap
+
+
+def _times_to(wall: Wall, left_behind: Any) -> Any:
+    """When the gap closes: infinite where it does not, negative where rounding could decide."""
+    gap = jnp.where(left_behind, 0.0, jnp.maximum(wall.gap, 0.0))
+    rate = jnp.where(left_behind, jnp.maximum(wall.rate, 0.0), wall.rate)
+    closes = rate < 0
+    if is_constant(wall.pull) and wall.pull == 0:
+        return jnp.where(closes, gap / jnp.where(closes, -rate, 1.0), jnp.inf)
+    square = rate * rate - 4.0 * wall.pull * gap
+    # Not only a root, but an impact that is well above rounding, so that the ball bounces.
+    clear = square > 8.0 * abs(wall.pull) * wall.noise + 64.0 * float(jnp.finfo(rate.dtype).eps) * rate * rate
+    edge = jnp.sqrt(jnp.where(clear, square, 1.0))
+    closing = jnp.where(closes, 2.0 * gap, rate + edge) / jnp.where(closes, edge - rate, _positive(-2.0 * wall.pull))
+    found = jnp.where(clear, closing, -1.0)
+    opens = jnp.asarray(wall.pull >= 0) & ((square < 0) | ~closes)  # nothing pulls it there
+    return jnp.where(opens, jnp.inf, found)
+
+
+def _positive(x: Number) -> Number:
+    return x if is_constant(x) and x > 0 else jnp.where(jnp.asarray(x > 0), x, 1.0)
+
+
+def _are_apart(a: Wall, b: Wall, room: Number) -> bool:
+    """Whether two planes are known to face each other at a distance, so that no ball touches both."""
+    known = all(is_constant(c) for c in (*a.normal, *b.normal, room))
+    return known and all(x == -y for x, y in zip(a.normal, b.normal, strict=True)) and bool(room > 1e-3)
+
+
+def hop(
+    walls: Sequence[Wall],
+    rooms: Callable[[int, int], Number],
+    gravity: Vector3,
+    kicked: Callable,
+    dies_out: Callable,
+    touching: Any,
+    going: Any,
+    full: Any,
+    left: Any,
+    state: Any,
+) -> Hop:
+    """One hop of a ball.
+
+    **Arguments:** `rooms(i, j)`: the distance between two planes that face each other, less the ball, relative to the
+    size of the scene; `kicked(choice, velocity, spin)`: the velocities after an impact; `dies_out(i, speed, left)`:
+    whether bounces may die out after an impact of that normal speed.
+    """
+    steps = shared([_times_to(wall, touching == i) for i, wall in enumerate(walls)])
+    h, which = steps[0], jnp.zeros_like(left)
+    for i, step in enumerate(steps[1:], 1):
+        which = jnp.where(step < h, float(i), which)
+        h = jnp.minimum(h, step)
+    hits, hops = h <= left, jnp.isfinite(left) & (h >= 0)
+    for i, wall in enumerate(walls):
+        there = (which == i) & hits
+        near = [j for j, other in enumerate(walls) if j != i and not _are_apart(wall, other, rooms(i, j))]
+        for j in near:
+            gap = walls[j].gap + h * (walls[j].rate + walls[j].pull * h)
+            hops = hops & ~(there & (gap <= 32.0 * walls[j].noise))
+        ends = dies_out(i, -(wall.rate + 2.0 * wall.pull * h), left - h)
+        hops = hops if ends is None else hops & ~(there & ends)
+    choice = jnp.where(hops, jnp.where(hits, jnp.where(full, FULL, which), ENDS), PAUSES)
+    duration = jnp.where(going & hops, jnp.minimum(h, left), 0.0)
+    choice = jnp.where(going, choice, PAUSES)
+    duration, choice = shared([duration, choice])
+    struck = choice >= 0
+    x, v, spin = state
+    position = add(x, scale(duration, add(v, scale(times(0.5, duration), gravity))))
+    velocity = add(v, scale(duration, gravity))
+    after, turned = kicked(choice, velocity, spin)
+    keep = lambda new, old: tuple(b if a is b else jnp.where(struck, a, b) for a, b in zip(new, old, strict=True))  # noqa: E731
+    return Hop(duration, choice, (position, keep(after, velocity), keep(turned, spin)))

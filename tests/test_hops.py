@@ -1,0 +1,150 @@
+"""Hops, from plane to plane in closed form, are the event loop: the same impacts, to rounding, and the same results; and
+where there is more to do than an ordinary bounce they leave it to the loop."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from nonholo_jax import (
+    RESULTS,
+    Ball,
+    BallState,
+    Exact,
+    Frictional,
+    Plane,
+    Rough,
+    Scene,
+    Smooth,
+    simulate,
+    simulate_batch,
+)
+from nonholo_jax._loop import _stopped, _unmarked
+
+BALL = Ball(0.1, 0.5)
+SLOPE = (0.6, 0.0, 0.8)
+WALLS = {
+    "floor": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "ceiling": ((0.0, 0.0, 2.0), (0.0, 0.0, -1.0)),
+    "left": ((-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    "right": ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
+    "slope": ((-1.2, 0.0, 0.0), SLOPE),
+}
+LAWS = {
+    "elastic": Rough(1.0),
+    "paper": Rough(0.8),
+    "rough": Rough(0.9, 0.4),
+    "smooth": Smooth(0.7),
+    "frictional": Frictional(0.85, 0.2, 0.3),
+}
+
+
+def throws(key, n, dtype):
+    keys = jax.random.split(key, 3)
+    position = jnp.array([[0.0, 0.0, 1.2]]) + jax.random.uniform(keys[0], (n, 3), minval=-0.6, maxval=0.6)
+    parts = position, 4.0 * jax.random.normal(keys[1], (n, 3)), 20.0 * jax.random.normal(keys[2], (n, 3))
+    return BallState(*(x.astype(dtype) for x in parts))
+
+
+def scene(law, names=tuple(WALLS), traced=False, gravity=(0.0, 0.0, -9.81)):
+    number = (lambda x: jnp.asarray(x, dtype=float)) if traced else (lambda x: x)
+    planes = {name: Plane(number(WALLS[name][0]), number(WALLS[name][1]), LAWS[law]) for name in names}
+    return Scene(BALL, planes, number(gravity))
+
+
+def both(room, states, **options):
+    """By hops, which keep no log, and by the loop alone, which does."""
+    hops = simulate_batch(room, states, log_size=0, **options)
+    return hops, simulate_batch(room, states, **options)
+
+
+def agree(hops, loop, tolerance, share=1.0):
+    """But for lanes that rounding has sent another way: at most a `share` less than all of them."""
+    same = np.asarray((hops.n_impacts == loop.n_impacts) & (hops.result == loop.result))
+    assert same.mean() >= share, same.mean()
+    for a, b in zip(jax.tree.leaves((hops.final, hops.t1)), jax.tree.leaves((loop.final, loop.t1)), strict=True):
+        error = np.abs(np.asarray(a - b)).reshape(len(same), -1).max(axis=1) / (1.0 + np.nanmax(np.abs(np.asarray(b))))
+        assert np.isnan(a).sum() == np.isnan(b).sum()
+        assert np.nanquantile(error[same], 1.0 if share == 1.0 else 0.98) < tolerance
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("sum_trains", [True, False])
+def test_a_room(getkey, law, sum_trains):
+    """Five planes, with corners, ramps and dying bounces, each law; 12 impacts do not amplify rounding by 1e6."""
+    states = throws(getkey(), 300, float)
+    agree(*both(scene(law), states, t1=2.0, max_impacts=12, sum_trains=sum_trains), 1e-9, share=0.99)
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (3.0, 0.0, -9.0)])
+def test_traced_numbers_and_any_gravity(getkey, gravity):
+    states = throws(getkey(), 300, float)
+    room = scene("rough", traced=True, gravity=gravity)
+    agree(*both(room, states, t1=1.0, max_impacts=12), 1e-9, share=0.99)
+
+
+def test_single_precision(getkey):
+    states = throws(getkey(), 300, np.float32)
+    hops, loop = both(scene("elastic", ("floor", "ceiling")), states, t1=2.0, max_impacts=12)
+    assert hops.final.position.dtype == np.float32
+    agree(hops, loop, 1e-3, share=0.99)
+
+
+def test_it_stops_before_an_impact_too_many(getkey):
+    """In the place, and at the time, of the impact that it may not have."""
+    states = throws(getkey(), 300, float)
+    hops, loop = both(scene("elastic", ("floor", "ceiling")), states, t1=50.0, max_impacts=6)
+    assert (hops.result == RESULTS.max_impacts).all() and (hops.n_impacts == 6).all()
+    agree(hops, loop, 1e-11)
+
+
+def test_what_is_unusual_is_left_to_the_loop():
+    """A corner hit at once, a ball that lies, a plastic impact, a start in contact, a start within a wall, NaN, and a
+    throw that only touches the ceiling: the results of the loop, not only their numbers."""
+    room = scene("paper", ("floor", "ceiling", "left", "right"))
+    touch = 2.0 * 9.81 * (1.9 - 0.5)
+    position = [[0.0, 0, 1.0], [0.0, 0, 0.1], [0, 0, 0.1], [0.9, 0, 1.0], [0, 0, 0.05], [np.nan, 0, 1], [0, 0, 0.5]]
+    velocity = [[9.81, 0, -9.0], [1.0, 0, 0], [0, 0, -1.0], [1.0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, touch**0.5]]
+    states = BallState(jnp.asarray(position), jnp.asarray(velocity), jnp.ones((7, 3)))
+    hops, loop = both(room, states, t1=3.0, max_impacts=40)
+    agree(hops, loop, 1e-9)
+    assert (hops.result == RESULTS.invalid_state).tolist() == [False] * 4 + [True, True, False]
+
+
+def test_a_corner_is_one_impact():
+    """Thrown into the edge of two walls: one impact with both (4.2), not one after the other."""
+    room = scene("elastic", ("floor", "left", "right"), gravity=(0.0, 0.0, 0.0))
+    state = BallState([0.0, 0.0, 1.0], [0.9, 0.0, -0.9], [0.0, 3.0, 0.0])
+    hops, loop = simulate(room, state, t1=1.5, log_size=0), simulate(room, state, t1=1.5)
+    assert loop.impacts.surface[0] >= 0
+    np.testing.assert_allclose(hops.final.position, loop.final.position, atol=1e-12)
+    np.testing.assert_allclose(hops.final.spin, loop.final.spin, atol=1e-12)
+
+
+def test_a_lane_does_not_see_the_others(getkey):
+    """A lane that is not finite, or that goes on for longer, changes nothing in the lanes beside it."""
+    room = scene("rough", ("floor", "ceiling"))
+    states = throws(getkey(), 8, float)
+    alone = simulate_batch(room, states, t1=1.0, log_size=0)
+    worse = BallState(states.position.at[3].set(jnp.nan), states.velocity.at[5].mul(30.0), states.spin)
+    beside = simulate_batch(room, worse, t1=1.0, log_size=0)
+    rest = np.asarray([0, 1, 2, 4, 6, 7])
+    assert (beside.result == RESULTS.invalid_state).tolist() == [lane == 3 for lane in range(8)]
+    for a, b in zip(jax.tree.leaves(alone.final), jax.tree.leaves(beside.final), strict=True):
+        np.testing.assert_array_equal(a[rest], b[rest])
+
+
+def test_marks_can_be_read_back():
+    for mark in [(0, -1, 2), (0, 4, 1), (77, 2, 0), (10**6, 6, 2)]:
+        turn, touching, why = (jnp.asarray(x) for x in mark)
+        stopped = _stopped(turn, touching, why, 3)
+        assert stopped < -1 and tuple(int(x) for x in _unmarked(stopped, 3)) == mark
+
+
+def test_the_program_has_no_search():
+    """Where the scene is planes and no log is kept, the loop that hops comes first, and the search waits under a cond."""
+    room = scene("elastic", ("floor",))
+    state = BallState([0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    run = lambda size: str(jax.make_jaxpr(lambda s: simulate(room, s, t1=1.0, log_size=size, throw=False))(state))  # noqa: E731
+    assert run(0).count("while[") == 1 + run(4).count("while[")
+    assert Exact().is_closed_form
