@@ -24,7 +24,7 @@ from ._tiles import in_tiles
 from ._types import KINDS, RESULTS
 from ._vector import frozen, norm
 
-_CHUNK = 16
+_CHUNK, _CHUNKS_AT_ONCE = 16, 4
 _HOP_TILE = 1024
 _MOST_IMPACTS_AT_ONCE = 32
 
@@ -213,7 +213,8 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     row, labels = Row(time, until, since, arrived, after), jnp.stack([name, _code(kind), system.phase(after)])
     log = _written(c.log, c.n_impacts, struck & ~c.done, pack_row(row), labels)
     sizes = frozen(jnp.stack([jnp.where(last, jnp.inf, length), s]))
-    path = _written(c.path, c.n_arcs, ended & ~c.done, sizes, jnp.stack([found.contact, labels[1]]))
+    place = c.n_arcs % max(c.path.labels.shape[0], 1)
+    path = _written(c.path, place, ended & ~c.done, sizes, jnp.stack([found.contact, labels[1]]))
 
     result = RESULTS.where(crossed & full, RESULTS.max_impacts, c.result)
     result = RESULTS.where(crossed & stuck, RESULTS.corner, result)
@@ -325,9 +326,9 @@ def _can_hop(system: AbstractSystem, motion: AbstractMotion, state: Any, max_imp
     return motion.is_closed_form and few and system.can_hop(state)
 
 
-def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, path_rows: int, kind: Any = "lax"):
-    """Run the loop; returns the outcome and the path. `kind` chooses how the loop itself may be differentiated."""
-    carry = _start(system, motion, state, t0, t1, log_rows, path_rows)
+def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = "lax") -> Outcome:
+    """Run the loop. `kind` chooses how the loop itself may be differentiated."""
+    carry = _start(system, motion, state, t0, t1, log_rows, 0)
     turn = lambda c: _turn(c, system, motion, t1, max_impacts)  # noqa: E731
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
     if kind == "hop":
@@ -338,17 +339,25 @@ def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, path
         end = lax.while_loop(going, turn, carry)
     else:
         end = eqxi.while_loop(going, turn, carry, kind=kind, max_steps=motion.max_turns(max_impacts))
-    return Outcome(end.time, end.state, end.n_impacts, end.n_arcs, end.result, end.log), end.path
+    return Outcome(end.time, end.state, end.n_impacts, end.n_arcs, end.result, end.log)
 
 
-def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome:
-    """Repeat a path with derivatives. What was found (contacts, counts, the result) is taken from `known`."""
-    moves = known.n_arcs > 0  # a lane that cannot start computes harmless numbers, and gives back what was found
-    state = jax.tree.map(lambda x: jnp.where(moves, x, 1.0), _arrays(state, t0.dtype))
-    t0, t1 = (jnp.where(moves, t, 0.0) for t in (t0, t1))
-    _, memory = motion.begin(system, t0, state, t1)
-    log_rows = known.log.labels.shape[0]
-    reached = known.result == RESULTS.reached_t1
+class _Replay(NamedTuple):
+    """A motion that is repeated with derivatives."""
+
+    time: Any
+    state: Any
+    memory: Any
+    jumped: Any
+    since: Any
+    n_impacts: Any
+    values: Any  # of the log
+
+
+def _repeat(r: _Replay, steps: tuple, system, motion, t1: Any, known: _Carry) -> _Replay:
+    """The arcs of one part of a path, which the search `known` has come to the end of."""
+    log_rows = r.values.shape[0]
+    reached = known.done & (known.result == RESULTS.reached_t1)
 
     def one(carry, step):
         time, state, memory, jumped, since, n_impacts = carry
@@ -387,37 +396,74 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         )
         return carry, (row, jnp.where(struck, n_impacts, log_rows))
 
-    def chunk(carry, steps):
-        def run(carry):
-            inner, buffer = carry
-            inner, (rows, where) = lax.scan(jax.checkpoint(one, prevent_cse=False), inner, steps)
-            return inner, buffer.at[where].set(rows, mode="drop") if log_rows else buffer
+    def chunk(r, steps):
+        def run(r):
+            inner, (rows, where) = lax.scan(jax.checkpoint(one, prevent_cse=False), tuple(r[:-1]), steps)
+            return _Replay(*inner, r.values.at[where].set(rows, mode="drop") if log_rows else r.values)
 
-        needed = eqxi.unvmap_any(steps[0][0] < known.n_arcs)
-        return lax.cond(needed, run, lambda carry: carry, carry), None
+        return lax.cond(eqxi.unvmap_any(steps[0][0] < known.n_arcs), run, lambda r: r, r), None
 
-    values = jnp.where(jnp.isnan(known.log.values), known.log.values, 0.0)  # rows that are not used stay NaN
-    rows = path.labels.shape[0]
-    size = min(_CHUNK, rows)
-    padding = -rows % size
-    steps = (
-        jnp.arange(rows + padding, dtype=jnp.int32),
-        jnp.pad(path.sizes, ((0, padding), (0, 0))),
-        jnp.pad(path.labels, ((0, padding), (0, 0))),
-    )
-    steps = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), steps)
-    steps = (steps[0], *[(pair[..., 0], pair[..., 1]) for pair in steps[1:]])
+    return lax.scan(chunk, r, steps)[0]
+
+
+def _resumed(system, motion, t1, carry: _Carry, stop: Any, max_impacts: int) -> _Carry:
+    """The loop, as far as every lane has ended or gone through `stop` arcs."""
+
+    def turn(state):
+        c, ended = state
+        paused = c.n_arcs >= stop
+        c = _turn(c._replace(done=ended | paused), system, motion, t1, max_impacts)
+        return c, ended | (c.done & ~paused)
+
+    going = lambda state: eqxi.unvmap_any(~state[1] & (state[0].n_arcs < stop))  # noqa: E731
+    carry, ended = lax.while_loop(going, turn, (carry, carry.done))
+    return carry._replace(done=ended)
+
+
+def replay(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int) -> Outcome:
+    """The motion with derivatives. By turns a part of the path is found without them and repeated with them, so that
+    only one part at a time is in memory."""
+    still = frozen((system, motion))
+    chunks = -(-motion.max_pieces(max_impacts) // _CHUNK)
+    size = -(-motion.max_pieces(max_impacts) // chunks)  # equal chunks, none of which is mostly padding
+    per_part = min(chunks, _CHUNKS_AT_ONCE)
+    rows = size * per_part
+    begin = _start(*still, *frozen((state, t0, t1)), log_rows, rows)
+    moves = ~begin.done  # a lane that cannot start computes harmless numbers, and gives back what was found
+    state = jax.tree.map(lambda x: jnp.where(moves, x, 1.0), _arrays(state, t0.dtype))
+    t0, t1 = (jnp.where(moves, t, 0.0) for t in (t0, t1))
+    _, memory = motion.begin(system, t0, state, t1)
+    end = frozen(t1)
+    values = jnp.where(jnp.isnan(begin.log.values), 0.0, begin.log.values)
+
+    def part(both, first):
+        def run(both):
+            search, r = both
+            empty = jax.tree.map(jnp.zeros_like, search.path.sizes), jnp.full_like(search.path.labels, -1)
+            resume = lambda system, motion, t1, c, stop: _resumed(system, motion, t1, c, stop, max_impacts)  # noqa: E731
+            search = in_tiles(resume, motion.tile)(*still, end, search._replace(path=Path(*empty)), first + rows)
+            search = frozen(search)
+            index = first + jnp.arange(rows, dtype=jnp.int32)
+            steps = jax.tree.map(lambda x: x.reshape(per_part, size, *x.shape[1:]), (index, *search.path))
+            steps = (steps[0], *[(pair[..., 0], pair[..., 1]) for pair in steps[1:]])
+            return search, _repeat(r, steps, system, motion, t1, search)
+
+        return lax.cond(eqxi.unvmap_any(~both[0].done), run, lambda both: both, both), None
+
     zero = jnp.asarray(0, dtype=jnp.int32)
-    first = (t0, state, memory, jnp.asarray(True), jnp.zeros_like(t0), zero)
-    ((time, state, *_), values), _ = lax.scan(chunk, (first, values), steps)
-    time, state = _keep(moves, (time, state), (known.time, known.state))
-    return known._replace(time=time, state=state, log=Log(values, known.log.labels))
+    r = _Replay(t0, state, memory, jnp.asarray(True), jnp.zeros_like(t0), zero, values)
+    firsts = rows * jnp.arange(-(-chunks // per_part), dtype=jnp.int32)
+    body = part if firsts.size == 1 else jax.checkpoint(part, prevent_cse=False)
+    (search, r), _ = lax.scan(body, (begin, r), firsts)
+    time, state = _keep(moves, (r.time, r.state), (search.time, search.state))
+    log = Log(jnp.where(jnp.isnan(search.log.values), search.log.values, r.values), search.log.labels)
+    return Outcome(time, state, search.n_impacts, search.n_arcs, search.result, log)
 
 
 def _find(system, motion, state, t0, t1, **options):
     """`find`, not differentiated, and in tiles where it is batched."""
     primals = frozen((system, motion, state, t0, t1))
-    if options["log_rows"] == options["path_rows"] == 0 and _can_hop(system, motion, state, options["max_impacts"]):
+    if options["log_rows"] == 0 and _can_hop(system, motion, state, options["max_impacts"]):
         return _find_by_hops(*primals, **options)
     return in_tiles(lambda *primals: find(*primals, **options), motion.tile)(*primals)
 
@@ -427,27 +473,23 @@ def _find_by_hops(system, motion, state, t0, t1, **options):
     form of a state, few arrays instead of many."""
 
     def part(system, motion, user, phase, t0, t1):
-        outcome, path = find(system, motion, system.unpacked(user, phase), t0, t1, kind="hop", **options)
-        return outcome._replace(state=(system.packed(outcome.state), system.phase(outcome.state))), path
+        outcome = find(system, motion, system.unpacked(user, phase), t0, t1, kind="hop", **options)
+        return outcome._replace(state=(system.packed(outcome.state), system.phase(outcome.state)))
 
     given = (system, motion, system.packed(_arrays(state, t0.dtype)), system.phase(state), t0, t1)
-    outcome, path = in_tiles(part, _HOP_TILE)(*given)
-    return outcome._replace(state=system.unpacked(*outcome.state)), path
+    outcome = in_tiles(part, _HOP_TILE)(*given)
+    return outcome._replace(state=system.unpacked(*outcome.state))
 
 
 @eqx.filter_custom_jvp
 def _find_or_replay(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int):
-    outcome, _ = _find(system, motion, state, t0, t1, max_impacts=max_impacts, log_rows=log_rows, path_rows=0)
-    return outcome
+    return _find(system, motion, state, t0, t1, max_impacts=max_impacts, log_rows=log_rows)
 
 
 @_find_or_replay.def_jvp
 def _find_or_replay_jvp(primals, tangents, *, max_impacts: int, log_rows: int):
-    _, motion, *_ = primals
-    path_rows = motion.max_pieces(max_impacts)
-    outcome, path = _find(*primals, max_impacts=max_impacts, log_rows=log_rows, path_rows=path_rows)
-    repeat = lambda system, motion, state, t0, t1: replay(system, motion, state, t0, t1, path, outcome)  # noqa: E731
-    return eqx.filter_jvp(repeat, primals, tangents)
+    options = {"max_impacts": max_impacts, "log_rows": log_rows}
+    return eqx.filter_jvp(lambda *primals: replay(*primals, **options), primals, tangents)
 
 
 def run(
@@ -466,9 +508,9 @@ def run(
     if adjoint is None:
         return _find_or_replay(system, motion, state, t0, t1, **options)
     if isinstance(adjoint, diffrax.ForwardMode):
-        return find(system, motion, state, t0, t1, path_rows=0, **options)[0]
+        return find(system, motion, state, t0, t1, **options)[0]
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        return find(system, motion, state, t0, t1, path_rows=0, kind="checkpointed", **options)[0]
+        return find(system, motion, state, t0, t1, kind="checkpointed", **options)[0]
     raise ValueError(
         "Argument `adjoint` must be None, diffrax.ForwardMode() or diffrax.RecursiveCheckpointAdjoint(), but got "
         f"{adjoint}; try None, which serves both modes."

@@ -15,6 +15,7 @@ from ._motion import AbstractMotion, Exact
 from ._motion_integrated import Integrated
 from ._scene import Scene
 from ._system import AbstractSystem
+from ._tiles import free_devices, over_devices
 from ._trajectory import Trajectory, packaged
 from ._types import is_failure, result_message, result_name
 from ._vector import as_number, as_pair, as_quaternion, as_vector
@@ -104,7 +105,8 @@ def simulate_batch(
     - `log_size`: the log of a large batch is most of its memory and time; 0 if only the final states are wanted.
     - `throw`: False by default: one failed lane must not lose a batch. Each lane has its own `Trajectory.result`.
 
-    Returns a `Trajectory` with a leading axis N.
+    Returns a `Trajectory` with a leading axis N. The batch is spread over all devices of the process, unless it is called
+    within a transformation or somebody has put an argument on a device.
 
     ```python
     import jax, jax.numpy as jnp
@@ -124,7 +126,8 @@ def simulate_batch(
     dtype = jax.tree.leaves(states)[0].dtype
     t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
     _check_times(t0, t1)
-    trajectory = _run_batch(system, motion, states, t0, t1, axes, max_impacts, log_rows, adjoint)
+    devices = free_devices((system, motion, states, t0, t1))
+    trajectory = _run_batch(system, motion, states, t0, t1, axes, max_impacts, log_rows, adjoint, devices)
     return _raised(trajectory) if throw else trajectory
 
 
@@ -178,24 +181,30 @@ def _run(scene, motion, state, t0, t1, max_impacts: int, log_rows: int, adjoint)
 
 
 @eqx.filter_jit
-def _run_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, log_rows: int, adjoint) -> Trajectory:
+def _run_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, log_rows: int, adjoint, devices: int):
     scene = _cast(scene, t1.dtype)
     leaves, treedef = jax.tree.flatten(scene)
-    mapped = [leaf for leaf, axis in zip(leaves, axes, strict=True) if axis is not None]
     options = {"max_impacts": max_impacts, "log_rows": log_rows, "adjoint": adjoint}
-
-    def one(state, mapped):
-        own = iter(mapped)
-        each = [leaf if axis is None else next(own) for leaf, axis in zip(leaves, axes, strict=True)]
-        system = jax.tree.unflatten(treedef, each)
-        outcome = run(system, motion, system.unpacked(state), t0, t1, **options)
-        whole = packaged(system, motion, state, t0, outcome)
-        return dataclasses.replace(whole, system=None, motion=None)
-
-    in_axes = (0, [axis for axis in axes if axis is not None])
-    whole = jax.vmap(one, in_axes=in_axes)(states, mapped)
-    flags = tuple(axis is not None for axis in axes) + (False,) * len(jax.tree.leaves(motion))
     moved = [leaf if axis is None else jnp.moveaxis(leaf, axis, 0) for leaf, axis in zip(leaves, axes, strict=True)]
+    arrays, constants = eqx.partition(([moved[i] for i, axis in enumerate(axes) if axis is None], motion), eqx.is_array)
+
+    def batch(lanes, rest):
+        states, mapped = lanes
+        (alike, motion), t0, t1 = eqx.combine(rest[0], constants), rest[1], rest[2]
+
+        def one(state, mapped):
+            own, common = iter(mapped), iter(alike)
+            each = [next(common) if axis is None else next(own) for axis in axes]
+            system = jax.tree.unflatten(treedef, each)
+            outcome = run(system, motion, system.unpacked(state), t0, t1, **options)
+            whole = packaged(system, motion, state, t0, outcome)
+            return dataclasses.replace(whole, system=None, motion=None)
+
+        return jax.vmap(one)(states, mapped)
+
+    mapped = [leaf for leaf, axis in zip(moved, axes, strict=True) if axis is not None]
+    whole = over_devices(batch, (states, mapped), (arrays, t0, t1), devices)
+    flags = tuple(axis is not None for axis in axes) + (False,) * len(jax.tree.leaves(motion))
     return dataclasses.replace(whole, system=jax.tree.unflatten(treedef, moved), motion=motion, mapped=flags)
 
 
