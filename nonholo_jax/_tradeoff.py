@@ -21,11 +21,11 @@ from ._simulate import checked
 from ._ways import Outcome, Program, Setting, Way, ways
 
 SOLVERS = (diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8(), diffrax.Heun())
-_TIGHT = 1e-14  # tolerance of the reference, whose steps are no longer than this part of the duration
-_REFERENCE_STEPS = 256
+_TIGHT, _RIVALS = 1e-14, 1e-13  # tolerances of the reference, whose steps are no longer than this part of the duration,
+_REFERENCE_STEPS = 128  # and of what its gradient is checked against
 _LONGEST = f"1/{_REFERENCE_STEPS} of the duration a step"
 _MOST_STEPS = 16384
-_MOST_STEPS_OF_GRADIENT = 320  # a gradient writes down its steps: what would need more rungs is not worth the memory
+_MOST_STEPS_OF_GRADIENT = 200  # room for steps is written down and read whether it is used or not
 _TIGHTEST = {"float64": 1e-13, "float32": 1e-6}
 _SAMPLE = 16
 
@@ -100,6 +100,39 @@ class Tradeoff(NamedTuple):
         """The fastest row whose largest error is at most `error`; `None` if there is none."""
         reached = [row for row in self.rows if row.what == what and row.max_error <= error]
         return min(reached, key=lambda row: row.seconds_per_trajectory, default=None)
+
+    def table(self) -> list[str]:
+        """What it found, for people: for each way the time with which it gets below an error, and the front."""
+        trains = "summed" if self.sum_trains else "none, so that sum_trains=False"
+        lines = [f"{self.machine}; {self.n_throws} throws in one batch; trains: {trains}"]
+        lines.append(f"errors are of the final position, against {self.reference}")
+        for what in dict.fromkeys(row.what for row in self.rows):
+            unit = "m" if what == "value" else "relative"
+            lines += ["", f"{what}: us a trajectory of the cheapest with a largest error ({unit}) of at most"]
+            lines += self._matrix(what)
+            lines += ["", f"{what}: the Pareto front", f"  {'largest':>8}  {'median':>8}  {'us':>8}  {'spread':>6}"]
+            for row in self.front(what):
+                us, spread = 1e6 * row.seconds_per_trajectory, 100 * row.spread
+                errors = f"  {row.max_error:8.1e}  {row.median_error:8.1e}"
+                lines.append(f"{errors}  {us:8.1f}  {spread:4.0f} %  {row.label}")
+            others = [row for row in self.rows if row.what == what and row.n_other_itinerary]
+            for row in others:
+                rest = f"the others have at most {row.max_error_same:.1e}"
+                lines.append(f"  {row.label}: {row.n_other_itinerary} throws failed or have other impacts; {rest}")
+        return lines
+
+    def _matrix(self, what: str) -> list[str]:
+        marks = [10.0**-k for k in range(2, 14)]
+        lines = [f"  {'':25}" + "".join(f"{mark:8.0e}" for mark in marks) + "  compile s"]
+        ways: dict[tuple, list[Row]] = {}
+        for row in self.rows:
+            if row.what == what:
+                ways.setdefault((row.method, row.steps if row.steps != "exact" else "", row.dtype), []).append(row)
+        for way, rows in ways.items():
+            times = [[row.seconds_per_trajectory for row in rows if row.max_error <= mark] for mark in marks]
+            cells = "".join(f"{1e6 * min(each):8.1f}" if each else f"{'-':>8}" for each in times)
+            lines.append(f"  {way[0]:7}{way[1]:>9}{way[2]:>9}{cells}  {rows[0].compile_seconds:9.1f}")
+        return lines
 
     def report(self) -> dict[str, Any]:
         """All of it in words and numbers that JSON knows; what is infinite is `None`."""
@@ -197,8 +230,10 @@ class _Study:
             self.programs[key] = made, time.perf_counter() - begin
         return self.programs[key][0]
 
-    def tightest(self, way: Way, what: str = "value", max_steps: int = _MOST_STEPS) -> Outcome:
-        return self.program(way, what, max_steps).outcome(_TIGHT, self.setting.duration / _REFERENCE_STEPS)
+    def tightest(
+        self, way: Way, what: str = "value", max_steps: int = _MOST_STEPS, tolerance: float = _TIGHT
+    ) -> Outcome:
+        return self.program(way, what, max_steps).outcome(tolerance, self.setting.duration / _REFERENCE_STEPS)
 
     def find_reference(self, may_sum_trains: bool) -> tuple[str, float]:
         """What errors are against, and by how much that disagrees with another way to compute it."""
@@ -236,20 +271,23 @@ class _Study:
             and (job.way.steps != "fixed" or (job.way.dtype == "float64" and not self.setting.sum_trains))
         ]  # fmt: skip
         most = {self.best.name: int(self.references["value"].n_arcs.max())}
-        most[self.rival.name] = most[self.best.name]  # the longest steps are those of the reference, too
         for job in values:
             most[job.way.name] = max(most.get(job.way.name, 0), int(job.outcome.n_arcs.max()))
+        has_rival = self.rival.name in most
+        if has_rival:
+            steps = self.tightest(self.rival, tolerance=_RIVALS).n_arcs.max()
+            most[self.rival.name] = max(most[self.rival.name], int(steps))
         room = lambda way: 16 * (most[way.name] // 16 + 2)  # noqa: E731
         known = self.references["gradient"] = self.tightest(self.best, "gradient", room(self.best))
         for job in values:
             outcome = self.program(job.way, "gradient", room(job.way)).outcome(job.rung)
             self.jobs.append(_Job(job.way, job.rung, "gradient", outcome))
-        if (*self.rival.name, "gradient") not in self.programs:
+        if not has_rival:
             return "; gradients not checked against another solver", math.inf
-        other = self.tightest(self.rival, "gradient")
+        other = self.tightest(self.rival, "gradient", tolerance=_RIVALS)
         same = _same(known, other)
         apart = _largest((_distance(other.values, known.values) / _length(known.values))[same])
-        return f"; its gradients and those of Tsit5 agree to {apart:.1e}", apart
+        return f"; its gradients and those of Tsit5 at {_RIVALS:.0e} agree to {apart:.1e}", apart
 
     def timed(self, runs: int) -> tuple[Row, ...]:
         """Every row, timed by turns with all others, so that a busy machine slows them all."""
