@@ -49,7 +49,7 @@ def plot_tradeoff(found: Tradeoff, *, path: str | Path | None = None) -> Figure:
     title = f"{found.n_throws} throws in one batch; {found.machine}"
     figure.suptitle(title, fontsize=7, color=_FAINT, x=0.01, ha="left")
     if path is not None:
-        figure.savefig(path, dpi=200)
+        figure.savefig(path, dpi=160)
     return figure
 
 
