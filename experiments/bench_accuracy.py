@@ -56,14 +56,14 @@ def scattered(seed: int, n: int, center, reach, velocity, speed, spin: float = 5
 def cases(n: int, seed: int = 0) -> dict[str, Case]:
     floor = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), LAW)
     ceiling = lambda z: Plane((0.0, 0.0, z), (0.0, 0.0, -1.0), LAW)  # noqa: E731
-    still, air = (0.0, 0.0, 0.0), Air()
+    still, air, first = (0.0, 0.0, 0.0), Air(), 10 * seed
     walls = {
         f"{axis}{sign:+}": Plane((-1.5 * sign * x, -1.5 * sign * y, 0.0), (sign * x, sign * y, 0.0), LAW)
         for axis, (x, y) in {"x": (1.0, 0.0), "y": (0.0, 1.0)}.items()
         for sign in (1, -1)
     }
     table = load_scene(pathlib.Path(__file__).parent / "scenes" / "superball_under_table.toml")
-    keys = jax.random.split(jax.random.key(10 * seed + 1))
+    keys = jax.random.split(jax.random.key(first + 1))
     aimed = BallState(
         jnp.broadcast_to(table.throw.position, (n, 3)),
         table.throw.velocity[None] + 0.5 * jax.random.normal(keys[0], (n, 3)),
@@ -75,21 +75,21 @@ def cases(n: int, seed: int = 0) -> dict[str, Case]:
     return {
         "floor, ceiling": Case(
             Scene(BALL, {"floor": floor, "ceiling": ceiling(1.0)}, air=air),
-            scattered(10 * seed + 0, n, (0.0, 0.0, 0.5), (0.3, 0.3, 0.3), still, (6.0, 6.0, 6.0)),
+            scattered(first + 0, n, (0.0, 0.0, 0.5), (0.3, 0.3, 0.3), still, (6.0, 6.0, 6.0)),
             1.5,
         ),
         "under the table": Case(table.scene, aimed, 2.0),
         "room": Case(
             Scene(BALL, room, air=air),
-            scattered(10 * seed + 2, n, (0.0, 0.0, 1.0), (1.0, 1.0, 0.6), still, (8.0, 8.0, 8.0)),
+            scattered(first + 2, n, (0.0, 0.0, 1.0), (1.0, 1.0, 0.6), still, (8.0, 8.0, 8.0)),
             2.0,
         ),
         "in a sphere": Case(
-            Scene(BALL, inside, air=air), scattered(10 * seed + 3, n, still, (0.4,) * 3, still, (5.0,) * 3), 1.5
+            Scene(BALL, inside, air=air), scattered(first + 3, n, still, (0.4,) * 3, still, (5.0,) * 3), 1.5
         ),
         "post on a floor": Case(
             Scene(BALL, post, air=air),
-            scattered(10 * seed + 4, n, (0.0, 0.0, 1.0), (0.2, 0.15, 0.3), (4.0, 0.0, 0.0), (1.0, 0.4, 2.0)),
+            scattered(first + 4, n, (0.0, 0.0, 1.0), (0.2, 0.15, 0.3), (4.0, 0.0, 0.0), (1.0, 0.4, 2.0)),
             1.5,
         ),
     }
