@@ -26,5 +26,6 @@ from ._surface import (
     Implicit as Implicit,
     Plane as Plane,
 )
+from ._tradeoff import Row as Row, Tradeoff as Tradeoff, tradeoff as tradeoff
 from ._trajectory import ImpactLog as ImpactLog, Trajectory as Trajectory
 from ._types import KINDS as KINDS, RESULTS as RESULTS

@@ -66,7 +66,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    what = "Rough balls that fly and bounce: simulate a throw, or design one."
+    what = "Rough balls that fly and bounce: simulate a throw, design one, or measure error against time."
     codes = "Exit code: 0 done, 2 bad input, 3 the computation failed."
     parser = _Parser("nonholo", description=what, epilog=codes, allow_abbrev=False)
     parser.add_argument("--version", action="version", version=f"nonholo_jax {metadata.version('nonholo_jax')}")
@@ -74,13 +74,22 @@ def _parser() -> argparse.ArgumentParser:
     for verb, purpose in (
         ("simulate", "simulate the throw of a scene file"),
         ("design", "find the throw that reaches the goal of a scene file"),
+        ("tradeoff", "measure error against time for every way to run a scene file"),
     ):
         each = verbs.add_parser(verb, help=purpose, description=purpose.capitalize() + ".", allow_abbrev=False)
         each.add_argument("scene", metavar="SCENE.toml", help="scene file; see experiments/scenes for examples")
         each.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
-        each.add_argument("--out", metavar="DIR", help="folder for trajectory.png (default: nonholo-out/SCENE)")
-        each.add_argument("--float32", action="store_true", help="compute in float32 instead of float64")
+        each.add_argument("--out", metavar="DIR", help="folder for what is written (default: nonholo-out/SCENE)")
         each.add_argument("--no-plot", action="store_true", help="draw no picture")
+        if verb != "tradeoff":
+            each.add_argument("--float32", action="store_true", help="compute in float32 instead of float64")
+            continue
+        each.set_defaults(float32=False)
+        each.add_argument("-n", "--throws", type=int, default=256, help="size of the batch (default: %(default)s)")
+        spread = "throws differ by this part of the speed, and of the radius in position (default: %(default)s)"
+        each.add_argument("--spread", type=float, default=0.01, help=spread)
+        each.add_argument("--seed", type=int, default=0, help="of the throws (default: %(default)s)")
+        each.add_argument("--error", type=float, default=1e-6, help="wanted error in m (default: %(default)s)")
     return parser
 
 
@@ -99,22 +108,25 @@ def _run(options: argparse.Namespace, from_start: bool) -> int:
             if table in ("simulate", options.verb) and getattr(file, table) is None:
                 what = f"`{table}` must be given for nonholo {options.verb}, but got nothing"
                 raise _BadInput(f"{options.scene}: {what}; add [{table}] with {example}")
-        folder = None if options.no_plot else _writable(options.out, options.scene)
+        writes = options.verb == "tradeoff" or not options.no_plot
+        folder = _writable(options.out, options.scene) if writes else None
         clock = _CompileClock()
         if sys.stderr.isatty():
             print(f"nonholo: compiling the {options.verb}; this takes most of the time", file=sys.stderr, flush=True)
         try:
-            answer = {"simulate": _simulate, "design": _design}[options.verb](file)
+            answer = _VERBS[options.verb](file, options)
         except ValueError as error:  # arguments that only the computation itself can judge
             if not str(error).startswith("Argument "):
                 raise  # a fault of ours
             raise _BadInput(f"{options.scene}: {error}") from None
         seconds = {"import": importing, **clock.split()}
         picture = None
-        if folder is not None:
+        if folder is not None and not options.no_plot:
             began = time.perf_counter()
-            picture = _draw(file.scene, answer, folder / "trajectory.png")
+            picture = _draw(file.scene, answer, folder)
             seconds["plot"] = time.perf_counter() - began
+        if folder is not None and options.verb == "tradeoff":
+            _written(_finite(answer.report), folder / "tradeoff.json")
         _show(options, answer, seconds, picture)
     if answer.failure is not None:
         print(f"nonholo: {options.scene}: {' '.join(answer.failure.split())}", file=sys.stderr)
@@ -190,25 +202,41 @@ def _writable(out: str | None, scene: str) -> Path:
     return folder
 
 
-def _draw(scene: Any, answer: _Answer, path: Path) -> str | None:
+def _draw(scene: Any, answer: _Answer, folder: Path) -> str | None:
     """Write the picture; `None` where there is nothing to draw, which the answer then says."""
+    from ._tradeoff_plot import plot_tradeoff
     from .plot import plot_trajectory
 
+    path = folder / ("trajectory.png" if answer.trajectory is not None else "tradeoff.png")
     try:
-        plot_trajectory(scene, answer.trajectory, path=path, **answer.drawing)
+        if answer.trajectory is None:
+            plot_tradeoff(**answer.drawing, path=path)
+        else:
+            plot_trajectory(scene, answer.trajectory, path=path, **answer.drawing)
     except ValueError as error:
         answer.text.append(f"  no picture: {error}")
         return None
     except OSError as error:
-        what = f"argument --out must be a folder with room for {str(path)!r}, but got {error.strerror or error}"
-        raise _BadInput(f"{what}; choose another, or --no-plot") from None
+        raise _no_room(path, error) from None
     return str(path)
+
+
+def _no_room(path: Path, error: OSError) -> _BadInput:
+    what = f"argument --out must be a folder with room for {str(path)!r}, but got {error.strerror or error}"
+    return _BadInput(f"{what}; choose another, or --no-plot")
+
+
+def _written(report: dict[str, Any], path: Path) -> None:
+    try:
+        path.write_text(json.dumps(report, allow_nan=False, indent=1) + "\n")
+    except OSError as error:
+        raise _no_room(path, error) from None
 
 
 # The verbs
 
 
-def _simulate(file: Any) -> _Answer:
+def _simulate(file: Any, options: argparse.Namespace) -> _Answer:
     import jax
 
     from ._simulate import simulate
@@ -274,7 +302,7 @@ def _motion(scene: Any, trajectory: Any) -> dict[str, Any]:
     }
 
 
-def _design(file: Any) -> _Answer:
+def _design(file: Any, options: argparse.Namespace) -> _Answer:
     import jax
 
     from ._design import design
@@ -317,6 +345,65 @@ def _design(file: Any) -> _Answer:
     goal = file.design.goal
     drawing = {"hand" if isinstance(goal, ReturnTo) else "target": goal.point}
     return _Answer(report, text, answer.trajectory, drawing, failure)
+
+
+def _tradeoff(file: Any, options: argparse.Namespace) -> _Answer:
+    from ._tradeoff import tradeoff
+
+    for name, value, fits in (
+        ("-n/--throws", options.throws, options.throws >= 1),
+        ("--spread", options.spread, 0 <= options.spread < math.inf),
+        ("--seed", options.seed, 0 <= options.seed < 2**32),
+        ("--error", options.error, 0 < options.error < math.inf),
+    ):
+        if not fits:
+            raise _BadInput(f"argument {name} must be positive and finite, but got {value}; leave it out")
+    how = file.simulate.arguments
+    times = {name: how[name] for name in ("t0", "t1", "max_impacts") if name in how}
+    trains = None if how.get("sum_trains", True) else False
+    states = _scattered(file, options.throws, options.spread, options.seed)
+    found = tradeoff(file.scene, states, **times, sum_trains=trains, progress=sys.stderr.isatty())
+    wanted = f"{options.error:g} m"
+    best = found.cheapest(options.error)
+    report = {
+        "throw": _state(file.throw),
+        "batch": {"throws": options.throws, "spread": options.spread, "seed": options.seed},
+        **found.report(),
+        "error": options.error,
+        "cheapest": None if best is None else best.label,
+    }
+    text, failure = found.table(), None
+    if best is None:
+        closest = min(found.rows, key=lambda row: row.max_error if row.what == "value" else math.inf)
+        failure = (
+            f"no way reached {wanted}: the closest is {closest.label} with {closest.max_error:.1e} m; raise --error"
+        )
+    else:
+        us = 1e6 * best.seconds_per_trajectory
+        text += ["", f"cheapest for {wanted}: {best.label}: {us:.1f} us, largest error {best.max_error:.1e} m"]
+    return _Answer(report, text, None, {"found": found}, failure)
+
+
+def _scattered(file: Any, n: int, spread: float, seed: int) -> Any:
+    """The throw of the file, n times, each a little different."""
+    import jax
+    import jax.numpy as jnp
+
+    from ._ball import BallState
+
+    throw, radius = file.throw, file.scene.ball.radius
+    speed = math.sqrt(math.fsum(float(x) ** 2 for x in throw.velocity)) or 1.0
+    sizes = (radius, speed, speed / radius)
+    keys = jax.random.split(jax.random.key(seed), 3)
+    fields = [
+        x[None] + spread * size * jax.random.normal(key, (n, 3), x.dtype)
+        for x, size, key in zip((throw.position, throw.velocity, throw.spin), sizes, keys, strict=True)
+    ]
+    turned = None if throw.orientation is None else jnp.broadcast_to(throw.orientation, (n, 4))
+    return BallState(*fields, orientation=turned)
+
+
+_VERBS = {"simulate": _simulate, "design": _design, "tradeoff": _tradeoff}
 
 
 # Printing

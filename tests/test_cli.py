@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 import pytest
 
+from nonholo_jax import _tradeoff
 from nonholo_jax.cli import main
 
 BASE = """\
@@ -356,6 +357,45 @@ def test_design_without_an_answer_is_exit_code_3_with_an_honest_report(tmp_path,
     out, err = capsys.readouterr()
     assert "not found" in out and out.count("came no closer than") == 2
     assert err.count("\n") == 1 and "missed by" in err and "widen" in err
+
+
+@pytest.fixture
+def small_tradeoff(monkeypatch):
+    """Only what compiles in seconds; test_tradeoff.py has the rest."""
+    whole = _tradeoff.tradeoff
+    less = {"solvers": [], "dtypes": ["float64"], "gradients": False, "runs": 1}
+    monkeypatch.setattr(_tradeoff, "tradeoff", lambda *args, **how: whole(*args, **how | less))
+
+
+def test_tradeoff_prints_one_json_object_and_writes_table_and_picture(tmp_path, capsys, small_tradeoff):
+    scene = tmp_path / "bounce.toml"
+    scene.write_text(BOUNCE)
+    answer, err = _json(capsys, ["tradeoff", str(scene), "--json", "--out", str(tmp_path), "-n", "4"])
+    assert err == "" and answer["verb"] == "tradeoff" and answer["cheapest"] == "Exact, float64"
+    (row,) = answer["rows"]
+    assert row["method"] == "Exact" and row["max_error"] == 0.0 and "mpmath" in answer["reference"]
+    assert answer["batch"] == {"throws": 4, "spread": 0.01, "seed": 0} and answer["n_throws"] == 4
+    assert json.loads((tmp_path / "tradeoff.json").read_text())["rows"] == answer["rows"]
+    assert (tmp_path / "tradeoff.png").read_bytes().startswith(b"\x89PNG")
+    assert answer["picture"] == str(tmp_path / "tradeoff.png")
+
+
+def test_tradeoff_names_the_cheapest(tmp_path, capsys, small_tradeoff):
+    scene = tmp_path / "bounce.toml"
+    scene.write_text(BOUNCE)
+    assert main(["tradeoff", str(scene), "--no-plot", "--out", str(tmp_path), "-n", "4", "--error", "1e-9"]) == 0
+    out = capsys.readouterr().out
+    assert "cheapest for 1e-09 m: Exact, float64" in out and "Pareto front" in out and "mpmath at 50 digits" in out
+    assert not (tmp_path / "tradeoff.png").exists() and (tmp_path / "tradeoff.json").exists()
+
+
+@pytest.mark.parametrize("option, value", [("-n", "0"), ("--error", "0"), ("--error", "nan"), ("--spread", "-1"),
+                                           ("--seed", "-1"), ("-n", "many")])  # fmt: skip
+def test_bad_options_of_tradeoff_are_one_line(tmp_path, capsys, option, value):
+    scene = tmp_path / "bounce.toml"
+    scene.write_text(BOUNCE)
+    line = _refusal(capsys, ["tradeoff", str(scene), "--out", str(tmp_path), option, value])
+    assert option in line and value in line
 
 
 def test_version(capsys):

@@ -41,6 +41,7 @@ ORDER = [
     "_motion",
     "_motion_integrated",
     "_loop",
+    "_accuracy",
     "_trajectory",
     "_simulate",
     # questions asked of motion
@@ -48,6 +49,9 @@ ORDER = [
     "_names",
     "_goal",
     "_design",
+    "_fifty_digits",
+    "_ways",
+    "_tradeoff",
     "_montecarlo",
     # face
     "_scene_schema",
@@ -55,6 +59,7 @@ ORDER = [
     "_outline",
     "_samples",
     "plot",
+    "_tradeoff_plot",
     "cli",
 ]
 FILES = sorted(PACKAGE.rglob("*.py"))
