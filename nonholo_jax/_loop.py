@@ -181,7 +181,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     s, resting, ends = jnp.where(through, arc.length, found.s), jnp.asarray(False), jnp.asarray(False)
     if system.n_contacts > 0:
         met = meeting(system, arc, found.s, found.contact)
-        s, resting, ends = jnp.where(crossed, newton(arc, s, met.value, met.rate), s), met.rests, met.ends
+        s, resting, ends = jnp.where(crossed, newton(arc, s, met.value, met.rate, met.noise), s), met.rests, met.ends
         (s,) = shared([s])
     elapsed = s * arc.unit
     reached = through & last
