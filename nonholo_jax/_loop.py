@@ -66,6 +66,7 @@ class Outcome(NamedTuple):
 class _Carry(NamedTuple):
     # where the motion is
     time: Any
+    ahead: Any  # by how much rounding has put `time` ahead of the motion
     state: Any
     memory: Any
     # how the present arc is searched
@@ -144,6 +145,7 @@ def _start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> _Car
     zero = jnp.asarray(0, dtype=jnp.int32)
     return _Carry(
         time=t0,
+        ahead=jnp.zeros_like(t0),
         state=state,
         memory=memory,
         s=jnp.zeros_like(t0),
@@ -165,7 +167,7 @@ def _start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> _Car
 
 def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, max_impacts: int) -> _Carry:
     """One turn: search one arc a little further; where that ends it, finish it."""
-    left = t1 - c.time
+    left = t1 - c.time + c.ahead
     size = jnp.where(c.done, 1.0, motion.size(c.control, left))  # finished lanes compute harmless numbers
     last = size >= left
     length = jnp.where(last, left, frozen(size))
@@ -185,7 +187,8 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
         (s,) = shared([s])
     elapsed = s * arc.unit
     reached = through & last
-    time = jnp.where(reached, t1, c.time + elapsed)
+    time, ahead = _later(c.time, c.ahead, elapsed)
+    time = jnp.where(reached, t1, time)
     arrived = _arrays(system.advanced(time, begun, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
     arrived = _shared(arrived)
 
@@ -226,6 +229,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     result = RESULTS.where(exhausted, RESULTS.step_limit, result)
     new = c._replace(
         time=jnp.where(struck, until, jnp.where(ended, time, c.time)),
+        ahead=jnp.where(ended, ahead, c.ahead),
         state=_keep(ended, _keep(struck, after, arrived), c.state),
         memory=_keep(ended, piece.memory, c.memory),
         s=jnp.where(kept & ~ended, frozen(found.s), 0.0),
@@ -250,6 +254,14 @@ def _keep_small(condition: Any, a: _Carry, b: _Carry) -> _Carry:
     fields = {name: _keep(condition, getattr(a, name), getattr(b, name))
               for name in _Carry._fields if name not in ("log", "path")}  # fmt: skip
     return _Carry(log=a.log, path=a.path, **fields)
+
+
+def _later(time: Any, ahead: Any, elapsed: Any) -> tuple[Any, Any]:
+    """The time after so many seconds, and by how much rounding has put that ahead: Kahan's sum. Bounces of one height
+    would otherwise all round it the same way, in float32 at 1e6 s by hundredths of a second each."""
+    step = elapsed - ahead
+    later = time + step
+    return later, frozen((later - time) - step)
 
 
 def _code(kind: Any) -> Any:
@@ -289,11 +301,11 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
     reached = known.result == RESULTS.reached_t1
 
     def one(carry, step):
-        time, state, memory, jumped, since, n_impacts = carry
+        time, ahead, state, memory, jumped, since, n_impacts = carry
         index, (size, s), (contact, code) = step
         used = index < known.n_arcs
         last = reached & (index == known.n_arcs - 1)
-        left = t1 - time
+        left = t1 - time + ahead
         whole = jnp.where(used, jnp.where(jnp.isinf(size), left, size), 0.0)
         begun = system.prepared(time, state)
         piece = motion.piece(system, time, begun, memory, jumped, whole)
@@ -304,7 +316,8 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         s = jnp.where(last, arc.length, s)
         s = jnp.where(used, s, 0.0)
         elapsed = s * arc.unit
-        moved = jnp.where(last, t1, time + elapsed)
+        moved, later = _later(time, ahead, elapsed)
+        moved = jnp.where(last, t1, moved)
         arrived = _arrays(system.advanced(moved, begun, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
         arrived = _shared(arrived)
         struck = crossed & (n_impacts < known.n_impacts)
@@ -317,6 +330,7 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
         row = pack_row(Row(moved, until, since + elapsed, arrived, after)) if log_rows else jnp.zeros((0,), t1.dtype)
         carry = (
             jnp.where(used, until, time),
+            jnp.where(used, later, ahead),
             _keep(used, after, state),
             _keep(used, piece.memory, memory),
             jnp.where(used, struck, jumped),
@@ -346,8 +360,8 @@ def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome
     steps = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), steps)
     steps = (steps[0], *[(pair[..., 0], pair[..., 1]) for pair in steps[1:]])
     zero = jnp.asarray(0, dtype=jnp.int32)
-    first = (t0, state, memory, jnp.asarray(True), jnp.zeros_like(t0), zero)
-    ((time, state, *_), values), _ = lax.scan(chunk, (first, values), steps)
+    first = (t0, jnp.zeros_like(t0), state, memory, jnp.asarray(True), jnp.zeros_like(t0), zero)
+    ((time, _, state, *_), values), _ = lax.scan(chunk, (first, values), steps)
     time, state = _keep(moves, (time, state), (known.time, known.state))
     return known._replace(time=time, state=state, log=Log(values, known.log.labels))
 
