@@ -225,7 +225,7 @@ def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meet
     rests = (bend < 0) & (rate * rate <= -2.0 * bend * tolerance)
     # On a plane a bounce of any height is computed, down to the rounding of the velocity itself.
     least = 16.0 * float(jnp.finfo(s.dtype).eps) * norm(here.tangent)
-    value = jnp.where(returns > 0.5, 0.0, value)
+    value = jnp.where(returns > 0.5, value - frozen(value), value)  # zero, with the derivative that it has
     exact = jnp.asarray(flat > 0.5) | (returns > 0.5)
     noise = select(contact, [_noise(system, i, arc) for i in range(system.n_contacts)])
     return Meeting(value, rate, noise, rests, rests & (~exact | (jnp.abs(rate) <= least)))  # pyright: ignore
