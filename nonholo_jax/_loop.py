@@ -294,7 +294,8 @@ def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, path
 def replay(system, motion, state, t0, t1, path: Path, known: Outcome) -> Outcome:
     """Repeat a path with derivatives. What was found (contacts, counts, the result) is taken from `known`."""
     moves = known.n_arcs > 0  # a lane that cannot start computes harmless numbers, and gives back what was found
-    state = jax.tree.map(lambda x: jnp.where(moves, x, 1.0), _arrays(state, t0.dtype))
+    harmless = lambda x: jnp.where(moves, x, jnp.ones_like(x)) if eqx.is_inexact_array(x) else x  # noqa: E731
+    system, state = jax.tree.map(harmless, (system, _arrays(state, t0.dtype)))  # NaN times zero is NaN in derivatives
     t0, t1 = (jnp.where(moves, t, 0.0) for t in (t0, t1))
     _, memory = motion.begin(system, t0, state, t1)
     log_rows = known.log.labels.shape[0]
