@@ -14,11 +14,11 @@ import numpy as np
 from mpmath import mp, mpf
 
 mp.dps = 50
-ROUNDINGS = 4  # relative roundings of each input that an answer may be off by
+ROUNDINGS = 16  # relative roundings of each input that an answer may be off by
 _STEP = mpf(10) ** -18  # of differences: errors of 1e-36
 _NEVER = mpf(10) ** 60
 _TINY = mpf(10) ** -45
-_WAYS = 8
+_WAYS = 12
 
 
 def exact(p: Any) -> list:
@@ -50,7 +50,7 @@ def spread(function: Callable, p: Sequence, eps: float, known: np.ndarray, round
     for _ in range(_WAYS):
         signs = rng.choice([-1.0, 1.0], len(p))
         moved = [x * (1 + roundings * mpf(eps) * s) for x, s in zip(p, signs, strict=True)]
-        far = np.maximum(far, np.abs(function(moved) - known))
+        far = np.maximum(far, np.nan_to_num(np.abs(function(moved) - known), nan=np.inf))
     return 2.0 * far
 
 
@@ -78,6 +78,8 @@ def slab(p: Sequence) -> list:
     """x, z, their velocities and the spin at t1."""
     x, z, vx, vz, w, alpha, _, r, e, e_t, gx, gz, floor, ceiling, left = p
     touching, share = 0, (1 + e_t) * alpha / (1 + alpha)
+    if ceiling - floor <= 2 * r:  # no room for the ball, among inputs that are hardly known
+        return [mpf("nan")] * 5
     while True:
         gaps = [(z - floor - r) * (touching != 1), (ceiling - r - z) * (touching != -1)]
         # The side that has just been hit is left at once, or never: a throw that starts beyond rounding is put on it.
@@ -105,16 +107,14 @@ def slab_long(p: Sequence) -> list:
     x, z, vx, vz, w, alpha, _, r, _, _, _, gz, floor, ceiling, t1 = p
     first = _first(z - floor - r, vz, gz)
     if gz < 0 and vz * vz < -2 * gz * (ceiling - r - z):
-        period, walls = -2 * (vz + gz * first) / gz, 1
+        period, walls = 2 * (vz + gz * first) / gz, 1
     else:
         period, walls = 2 * (ceiling - floor - 2 * r) / abs(vz), 2
     assert gz == 0 or walls == 1
     k = 2 / (1 + alpha)
 
     def impact(side):  # slip u = vx - side r w
-        return mpmath.matrix(
-            [[1, 0, 0], [0, 1 - k * alpha, k * alpha * side], [0, k * side, 1 - k]]
-        )
+        return mpmath.matrix([[1, 0, 0], [0, 1 - k * alpha, k * alpha * side], [0, k * side, 1 - k]])
 
     def flight(t):
         return mpmath.matrix([[1, t, 0], [0, 1, 0], [0, 0, 1]])
@@ -123,8 +123,7 @@ def slab_long(p: Sequence) -> list:
     count = int(mpmath.floor((t1 - first) / period))
     state = (whole * impact(1)) ** count * flight(first) * mpmath.matrix([x, vx, r * w])
     left, rise = t1 - first - count * period, -(vz + gz * first)
-    tail = slab([state[0], floor + r, state[1], -rise, state[2] / r, *p[5:14], left])
-    return tail
+    return slab([state[0], floor + r, state[1], -rise, state[2] / r, *p[5:8], mpf(1), mpf(1), *p[10:14], left])
 
 
 # A rough ball that flies straight and hits a box or a sphere, once: both are convex
