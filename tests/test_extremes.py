@@ -42,8 +42,8 @@ def test_a_lane_without_numbers_leaves_the_others_alone(seed):
     spoilt = {name: values.copy() for name, values in numbers.items()}
     name, lane = rng.choice(sorted(numbers)), int(rng.integers(LANES))
     flat = spoilt[name].reshape(LANES, -1)
-    column = 0 if name == "surfaces" else int(rng.integers(flat.shape[1]))  # not every shape uses all of its numbers
-    flat[lane, column if name != "laws" else 0] = rng.choice([np.nan, np.inf, -np.inf])
+    column = {"surfaces": 0, "laws": 1}.get(name, int(rng.integers(flat.shape[1])))  # not all are used by every kind
+    flat[lane, column] = rng.choice([np.nan, np.inf, -np.inf])
     run = lambda d: jax.tree.map(np.asarray, random_scenes.program(TEMPLATES[0])(jax.tree.map(jnp.asarray, d)))  # noqa: E731
     plain, mixed = run(numbers), run(spoilt)
     assert random_scenes.NAMES_OF_RESULTS[mixed[0][lane]] == "invalid_state"
