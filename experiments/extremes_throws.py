@@ -47,7 +47,7 @@ def worst(cells: Sequence[Cell]) -> Cell:
     names, expected = (
         tuple(sorted({name for cell in cells for name in getattr(cell, of)})) for of in Cell._fields[2:4]
     )
-    return Cell(top.error, top.bound, names, expected, sum(cell.bound >= 1 for cell in cells))
+    return Cell(top.error, top.bound, names, expected, sum(bool(cell.bound >= 1) for cell in cells))
 
 
 # Two families of throws, each one compiled program for all of its extremes
