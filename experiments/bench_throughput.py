@@ -1,11 +1,11 @@
 """How many bounces a second, beside a C program; gradients beside values; scaling.
 
 Sections: `limit`, floor and ceiling, elastic, 64 impacts of each throw, beside bounces.c (compiled here, -O3, OpenMP,
-state in registers), on one device and on all; `table`, the scene under_the_table.toml with its Box; `gradient`, the value
-of a scalar of the end against value and gradient in nine inputs, 16 impacts; `scaling`, with batch size, impacts and
-surfaces, with compilation time beside it. All ways of a section run by turns, medians after compilation.
+state in registers), on one device and on all; `table`, throws under a table, a Box; `gradient`, a scalar of the end
+against that and its gradient in nine inputs, 16 impacts; `scaling`, with batch size, impacts and surfaces, with
+compilation time beside it. All ways of a section run by turns, medians after compilation.
 
-    python experiments/bench_throughput.py [--sections limit,table,gradient,scaling] [--throws 1048576] [--runs 5] [--json F]
+    python experiments/bench_throughput.py [--sections limit,table] [--throws 1048576] [--runs 5] [--json FILE]
 """
 
 import argparse
@@ -87,7 +87,7 @@ class Limit:
         return columns, data
 
     def __call__(self, columns: np.ndarray, data: np.ndarray) -> np.ndarray:
-        numbers = [self.real(x) for x in (HEIGHT, BALL.radius, 9.81, BALL.inertia_ratio)]
+        numbers = [self.real(float(x)) for x in (HEIGHT, BALL.radius, 9.81, BALL.inertia_ratio)]
         n = ctypes.c_long(data.shape[1])
         self.run(ctypes.c_void_p(data.ctypes.data), ctypes.c_void_p(data[9].ctypes.data), n, BOUNCES, *numbers)
         return data
@@ -118,7 +118,7 @@ def limit(n: int, runs: int) -> list[dict]:
         states, scene = throws(n, dtype), room()
         own = lambda states, scene=scene: simulate_batch(scene, states, t1=1e3, max_impacts=BOUNCES, log_size=0)  # noqa: E731
         single = on_one_device(states)
-        ways: dict[str, Callable] = {"one device": lambda own=own, single=single: own(single).final}
+        ways: dict[str, Callable] = {"one device": lambda own=own, states=single: own(states).final}
         if len(jax.devices()) > 1:
             ways[f"{len(jax.devices())} devices"] = lambda own=own, states=states: own(states).final
         if shutil.which("cc") and jax.default_backend() == "cpu":
@@ -150,7 +150,7 @@ def table(n: int, runs: int) -> list[dict]:
         own = lambda states: simulate_batch(scene, states, t1=1.0, max_impacts=16, log_size=0)  # noqa: E731
         count = float(own(states).n_impacts.sum())
         single = on_one_device(states)
-        ways = {"one device": lambda own=own, single=single: own(single).final}
+        ways = {"one device": lambda own=own, states=single: own(states).final}
         if len(jax.devices()) > 1:
             ways[f"{len(jax.devices())} devices"] = lambda own=own, states=states: own(states).final
         for way, (compiling, median, spread_) in by_turns(ways, runs).items():
@@ -211,7 +211,8 @@ def printed(rows: list[dict]) -> None:
         extra = f"  {r['of_c']:.2f} of C" if "of_c" in r else ""
         extra += f"  {r['times_value']:.1f} x value" if "times_value" in r else ""
         head = f"{r['section']:>9}  {r['dtype']:>8}  {r['way']:>20}"
-        print(f"{head}  {r['rate']:9.3g} {r['unit']:9}  +- {r['spread']:4.0%}  compile {r['compile_seconds']:5.1f} s{extra}")
+        timing = f"+- {r['spread']:4.0%}  compile {r['compile_seconds']:5.1f} s"
+        print(f"{head}  {r['rate']:9.3g} {r['unit']:9}  {timing}{extra}")
 
 
 SECTIONS = {"limit": limit, "table": table, "gradient": gradient, "scaling": scaling}
@@ -228,7 +229,12 @@ def main() -> None:
     if unknown:
         parser.error(f"--sections must be of {', '.join(SECTIONS)}, but got {', '.join(sorted(unknown))}")
     print(f"{machine()}, {len(jax.devices())} devices, {options.throws} throws")
-    sizes = {"limit": options.throws, "table": options.throws // 16, "gradient": options.throws // 64, "scaling": options.throws}
+    sizes = {
+        "limit": options.throws,
+        "table": options.throws // 16,
+        "gradient": options.throws // 64,
+        "scaling": options.throws,
+    }
     rows = []
     for name in options.sections.split(","):
         new = SECTIONS[name](sizes[name], options.runs)

@@ -199,8 +199,16 @@ class Meeting(NamedTuple):
 
     value: Scalar
     rate: Scalar
+    noise: Any  # rates below this one, as a part of the speed, are not known
     rests: Bool[Array, ""]  # a bounce would not rise above rounding
     ends: Bool[Array, ""]  # nor could it be computed: the motion stays in contact
+
+
+def _noise(system: AbstractSystem, contact: int, arc: Arc) -> float:
+    """The part of the speed below which the rate of a level at its zero is rounding. On a plane it is that of the
+    velocity; elsewhere the zero itself is known only to the root of rounding where the level hardly changes."""
+    eps = float(jnp.finfo(arc.time.dtype).eps)
+    return 4.0 * eps if _is_exact(system, contact, arc.configuration) else eps**0.5
 
 
 def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meeting:
@@ -216,15 +224,16 @@ def meeting(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Meet
     value, rate, bend, tolerance = shared([value, rate, bend, tolerance])
     rests = (bend < 0) & (rate * rate <= -2.0 * bend * tolerance)
     # On a plane a bounce of any height is computed, down to the rounding of the velocity itself.
-    noise = 16.0 * float(jnp.finfo(s.dtype).eps) * norm(here.tangent)
-    value = jnp.where(returns > 0.5, 0.0, value)
+    least = 16.0 * float(jnp.finfo(s.dtype).eps) * norm(here.tangent)
+    value = jnp.where(returns > 0.5, value - frozen(value), value)  # zero, with the derivative that it has
     exact = jnp.asarray(flat > 0.5) | (returns > 0.5)
-    return Meeting(value, rate, rests, rests & (~exact | (jnp.abs(rate) <= noise)))  # pyright: ignore
+    noise = select(contact, [_noise(system, i, arc) for i in range(system.n_contacts)])
+    return Meeting(value, rate, noise, rests, rests & (~exact | (jnp.abs(rate) <= least)))  # pyright: ignore
 
 
-def newton(arc: Arc, s: Scalar, value: Number, rate: Number) -> Scalar:
-    """One Newton step for the zero of a level. Where it hardly changes (grazing) `s` is kept."""
-    steep = jnp.abs(rate) > float(jnp.finfo(s.dtype).eps) ** 0.5 * frozen(norm(arc.tangent(s)))
+def newton(arc: Arc, s: Scalar, value: Number, rate: Number, noise: Number) -> Scalar:
+    """One Newton step for the zero of a level. Where its rate is not known (grazing) `s` is kept."""
+    steep = jnp.abs(rate) > noise * frozen(norm(arc.tangent(s)))
     s = s - jnp.where(steep, value / jnp.where(steep, rate, 1.0), 0.0)
     return s - frozen(jnp.minimum(s, 0.0))  # not before the arc begins, with the derivative it has
 
@@ -234,10 +243,11 @@ def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Sc
     that second derivatives are right too."""
     known = s = frozen(s)
     returns = select(contact, [jnp.where(_returns(system, i, arc, s), 1.0, 0.0) for i in range(system.n_contacts)])
+    noise = select(contact, [_noise(system, i, arc) for i in range(system.n_contacts)])
     for _ in range(2):
         q, tangent = arc.position(s), arc.tangent(s)
         pairs = [
             slope(lambda x, i=i: system.level(i, arc.time, x, arc.start), q, tangent) for i in range(system.n_contacts)
         ]
-        (s,) = shared([newton(arc, s, *(select(contact, column) for column in zip(*pairs, strict=True)))])
+        (s,) = shared([newton(arc, s, *(select(contact, column) for column in zip(*pairs, strict=True)), noise)])
     return jnp.where(returns > 0.5, known + (s - frozen(s)), s)  # pyright: ignore[reportOperatorIssue]

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ._ball import BallState
 from ._impact import _dot, _whiten, projector
 from ._lagrangian import LagrangianSystem, as_arrays
-from ._loop import run
+from ._replay import run
 from ._scene import Scene
 from ._trajectory import Trajectory
 from ._types import KINDS, RESULTS

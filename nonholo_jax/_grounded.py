@@ -268,9 +268,9 @@ class Grounded(AbstractSystem):
             room = minimum(room, jnp.where(contact == i, jnp.inf, surface.clearance(x, time, radius)))
         return room
 
-    def _sums(self, contact: Any, time: Any, struck: Flight, first: train.Start, floor: tuple) -> tuple[Any, Any]:
-        """How long the train lasts, and whether it can be summed: no other surface nor an edge can be reached before it
-        ends, and air changes nothing."""
+    def _sums(self, contact: Any, time: Any, struck: Flight, first: train.Start, floor: tuple) -> tuple[Any, Any, Any]:
+        """How long the train lasts, whether it is clear of other surfaces and of edges until it ends, and whether it
+        has a sum: air changes nothing, and all impacts are of one kind."""
         lasts = train.duration(first, self._floors.law(contact).restitution)
         lasts_known = jnp.where(jnp.isfinite(lasts), lasts, 0.0)
         height = ratio(first.rise * first.rise, 2.0 * first.pull)
@@ -283,7 +283,7 @@ class Grounded(AbstractSystem):
         if struck.orientation is not None:  # infinitely many rotations have no sum
             calm = jnp.asarray(False)
         slips, grips = self._regime(contact, first)
-        return lasts, clear & calm & (slips | grips)
+        return lasts, clear, calm & (slips | grips)
 
     def _stays(self, contact: Any, support: Any) -> Any:
         """Whether a ball on `support` stays on it when it hits a surface: Theorem 5.1 needs one common mu there, and a
@@ -313,14 +313,16 @@ class Grounded(AbstractSystem):
         floor = self._floor(contact, time, state)
         first, law = self._start(time, struck, floor[0]), self._floors.law(contact)
         is_floor = self._floors.include(contact) & floor[0].below & (first.pull > 0)
-        lasts, sums = self._sums(contact, time, struck, first, floor)
+        lasts, clear, sums = self._sums(contact, time, struck, first, floor)
         capped = law.rolls & jnp.isfinite(jnp.inf if law.friction is None else law.friction)
-        dies_out = is_floor & (lasts <= left) & (sums | (rests & ~capped))
+        small = rests & ~capped  # whatever it is, it is taken for a train
+        dies_out = is_floor & (lasts <= left) & (small | (clear & sums))
         moves = dot(first.slip, first.slip) + dot(first.along, first.along) > 0
         endless = dies_out & law.rolls & ~capped & (abs(law.reversal) == 1) & (law.restitution < 1) & moves
         lies = is_floor & jnp.where(capped, ends, rests)
 
-        bounce_or_end = KINDS.where(dies_out, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
+        # Beside a wall a ball lies down where it is: what it goes during its last bounces could take it through.
+        bounce_or_end = KINDS.where(dies_out & clear, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
         wall = KINDS.where(self._stays(contact, state.support), KINDS.rolling, KINDS.bounce)
         over = KINDS.where(grips, KINDS.gripped, KINDS.left)
         kind = KINDS.where(on, KINDS.where(is_exit, over, wall), bounce_or_end)

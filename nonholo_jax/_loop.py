@@ -1,31 +1,25 @@
 """The event loop. It knows no ball: a system gives it arcs, levels and impacts over a state that is any pytree.
 
-Two passes (design decision "find, then replay"). `find` runs one flat loop: a turn searches one arc for its first
-crossing and finishes it with an impact, or goes on with the next arc; lanes of a batch are each in their own bounce.
-Where derivatives are taken, `find` runs without them and records the path (sizes of arcs, contacts), and `replay`
-repeats that path with derivatives in a scan that both modes of differentiation can handle.
+One flat loop: a turn searches one arc for its first crossing and finishes it with an impact, or goes on with the next
+arc; lanes of a batch are each in their own bounce. Where the system knows its next impact in closed form it hops.
 """
 
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ._crossing import meeting, newton, search
 from ._hops import ENDS, FULL
-from ._crossing import corrected, meeting, newton, search
 from ._motion import AbstractMotion
 from ._shared import shared
 from ._system import AbstractSystem
-from ._tiles import in_tiles
 from ._types import KINDS, RESULTS
 from ._vector import frozen, norm
 
-_CHUNK, _CHUNKS_AT_ONCE = 16, 4
-_HOP_TILE = 1024
 _MOST_IMPACTS_AT_ONCE = 32
 
 
@@ -65,9 +59,10 @@ class Outcome(NamedTuple):
     log: Log
 
 
-class _Carry(NamedTuple):
+class Carry(NamedTuple):
     # where the motion is
     time: Any
+    ahead: Any  # by how much rounding has put `time` ahead of the motion
     state: Any
     memory: Any
     # how the present arc is searched
@@ -105,7 +100,7 @@ def unpack_row(values: Any, like: Any) -> Row:
     return jax.tree.unflatten(treedef, rows)
 
 
-def _arrays(state: Any, dtype: Any) -> Any:
+def as_arrays(state: Any, dtype: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(x, dtype=dtype), state)
 
 
@@ -126,7 +121,7 @@ def _written(record: Any, index: Any, wanted: Any, *values: Any) -> Any:
     return type(record)(*[_write(buffer, index, wanted, x) for buffer, x in zip(record, values, strict=True)])
 
 
-def _shared(state: Any) -> Any:
+def computed_once(state: Any) -> Any:
     leaves, treedef = jax.tree.flatten(state)
     return jax.tree.unflatten(treedef, shared(leaves))
 
@@ -135,17 +130,18 @@ def _shared_flags(flags: tuple) -> list:
     return [flag > 0.5 for flag in shared([flag.astype(float) for flag in flags])]
 
 
-def _keep(condition: Any, new: Any, old: Any) -> Any:
+def keep(condition: Any, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def _start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> _Carry:
-    state = _arrays(state, t0.dtype)
+def start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> Carry:
+    state = as_arrays(state, t0.dtype)
     control, memory = motion.begin(system, t0, state, t1)
     admissible = system.is_admissible(t0, state) & jnp.isfinite(t0) & jnp.isfinite(t1) & (t1 >= t0)
     zero = jnp.asarray(0, dtype=jnp.int32)
-    return _Carry(
+    return Carry(
         time=t0,
+        ahead=jnp.zeros_like(t0),
         state=state,
         memory=memory,
         s=jnp.zeros_like(t0),
@@ -165,9 +161,9 @@ def _start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> _Car
     )
 
 
-def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, max_impacts: int) -> _Carry:
+def turn(c: Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, max_impacts: int) -> Carry:
     """One turn: search one arc a little further; where that ends it, finish it."""
-    left = t1 - c.time
+    left = t1 - c.time + c.ahead
     size = jnp.where(c.done, 1.0, motion.size(c.control, left))  # finished lanes compute harmless numbers
     last = size >= left
     length = jnp.where(last, left, frozen(size))
@@ -183,13 +179,14 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     s, resting, ends = jnp.where(through, arc.length, found.s), jnp.asarray(False), jnp.asarray(False)
     if system.n_contacts > 0:
         met = meeting(system, arc, found.s, found.contact)
-        s, resting, ends = jnp.where(crossed, newton(arc, s, met.value, met.rate), s), met.rests, met.ends
+        s, resting, ends = jnp.where(crossed, newton(arc, s, met.value, met.rate, met.noise), s), met.rests, met.ends
         (s,) = shared([s])
     elapsed = s * arc.unit
     reached = through & last
-    time = jnp.where(reached, t1, c.time + elapsed)
-    arrived = _arrays(system.advanced(time, begun, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
-    arrived = _shared(arrived)
+    time, ahead = later(c.time, c.ahead, elapsed)
+    time = jnp.where(reached, t1, time)
+    arrived = as_arrays(system.advanced(time, begun, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
+    arrived = computed_once(arrived)
 
     since = c.since + elapsed
     at_once = since * norm(frozen(arc.tangent(s))) <= _tiny(arc, s) * arc.unit
@@ -203,7 +200,7 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
         bounced = system.bounced(found.contact, time, arrived)
         kind, fault = system.follows(found.contact, time, arrived, bounced, t1 - time, resting, ends)
         after, pause = system.impact(found.contact, time, arrived, bounced, kind)
-        after = _arrays(after, t1.dtype)
+        after = as_arrays(after, t1.dtype)
     failed = fault != RESULTS.reached_t1
     stopped = crossed & (failed | full | stuck)
     stopped, crossed = _shared_flags((stopped, crossed))
@@ -229,13 +226,14 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     result = RESULTS.where(exhausted, RESULTS.step_limit, result)
     new = c._replace(
         time=jnp.where(struck, until, jnp.where(ended, time, c.time)),
-        state=_keep(ended, _keep(struck, after, arrived), c.state),
-        memory=_keep(ended, piece.memory, c.memory),
+        ahead=jnp.where(ended, ahead, c.ahead),
+        state=keep(ended, keep(struck, after, arrived), c.state),
+        memory=keep(ended, piece.memory, c.memory),
         s=jnp.where(kept & ~ended, frozen(found.s), 0.0),
         window=jnp.where(kept & ~ended, frozen(found.window), jnp.inf),
         touching=jnp.where(struck, name, jnp.where(through, -1, c.touching)),
         jumped=jnp.where(ended, struck, c.jumped),
-        control=_keep(ended | ~kept, control, c.control),
+        control=keep(ended | ~kept, control, c.control),
         since=jnp.where(struck, 0.0, jnp.where(ended, since, c.since)),
         n_impacts=c.n_impacts + struck.astype(jnp.int32),
         n_arcs=n_arcs,
@@ -248,11 +246,19 @@ def _turn(c: _Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, ma
     return _keep_small(c.done, old, new._replace(log=log, path=path))
 
 
-def _keep_small(condition: Any, a: _Carry, b: _Carry) -> _Carry:
-    """`_keep` for all but the buffers, which would be copied whole at every turn."""
-    fields = {name: _keep(condition, getattr(a, name), getattr(b, name))
-              for name in _Carry._fields if name not in ("log", "path")}  # fmt: skip
-    return _Carry(log=a.log, path=a.path, **fields)
+def _keep_small(condition: Any, a: Carry, b: Carry) -> Carry:
+    """`keep` for all but the buffers, which would be copied whole at every turn."""
+    fields = {name: keep(condition, getattr(a, name), getattr(b, name))
+              for name in Carry._fields if name not in ("log", "path")}  # fmt: skip
+    return Carry(log=a.log, path=a.path, **fields)
+
+
+def later(time: Any, ahead: Any, elapsed: Any) -> tuple[Any, Any]:
+    """The time after so many seconds, and by how much rounding has put that ahead: Kahan's sum. Bounces of one height
+    would otherwise all round it the same way, in float32 at 1e6 s by hundredths of a second each."""
+    step = elapsed - ahead
+    total = time + step
+    return total, frozen((total - time) - step)
 
 
 def _code(kind: Any) -> Any:
@@ -274,6 +280,7 @@ class _Hopping(NamedTuple):
     """A carry without what only a search needs."""
 
     time: Any
+    ahead: Any
     state: Any
     mark: Any  # the contact just left, or -1; once it has stopped, when and why, as `_stopped` has it
     turn: Any
@@ -289,229 +296,59 @@ def _unmarked(mark: Any, bits: int) -> tuple:
     return known >> (bits + 2), ((known >> 2) & ((1 << bits) - 1)) - 1, known & 3
 
 
-def _hopped(carry: _Carry, system: AbstractSystem, t1: Any, max_impacts: int) -> _Carry:
+def _hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int) -> Carry:
     """The motion as far as it is a row of ordinary impacts, known in closed form. All lanes that hop are at the same
     impact, so that the number of turns counts their impacts."""
 
-    bits = system.n_contacts.bit_length()
+    bits, left = system.n_contacts.bit_length(), max_impacts - carry.n_impacts
 
-    def turn(c: _Hopping) -> _Hopping:
+    def hop(c: _Hopping) -> _Hopping:
         going = c.mark >= -1
-        hop = system.hop(c.mark, going, c.turn >= max_impacts, t1 - c.time, c.state)
-        why = jnp.where(hop.choice == ENDS, 0, jnp.where(hop.choice == FULL, 1, 2))
+        done = system.hop(c.mark, going, c.turn >= left, t1 - c.time + c.ahead, c.state)
+        why = jnp.where(done.choice == ENDS, 0, jnp.where(done.choice == FULL, 1, 2))
         stop = _stopped(c.turn, jnp.maximum(c.mark, -1), why, bits)
-        mark = jnp.where(hop.choice >= 0, hop.choice.astype(jnp.int32), jnp.where(going, stop, c.mark))
-        return _Hopping(c.time + hop.duration, hop.state, mark, c.turn + 1)
+        mark = jnp.where(done.choice >= 0, done.choice.astype(jnp.int32), jnp.where(going, stop, c.mark))
+        time, ahead = later(c.time, c.ahead, done.duration)
+        return _Hopping(time, ahead, done.state, mark, c.turn + 1)
 
     zero = jnp.asarray(0, dtype=jnp.int32)
-    none = _stopped(zero, -1, 2, bits)
-    start = _Hopping(carry.time, carry.state, jnp.where(carry.done, none, carry.touching), zero)
-    end = lax.while_loop(lambda c: eqxi.unvmap_any(c.mark >= -1), turn, start)
+    free = ~carry.done & (carry.s == 0) & (system.phase(carry.state) < 0)
+    mark = jnp.where(free, carry.touching, _stopped(zero, -1, 2, bits))
+    begin = _Hopping(carry.time, carry.ahead, carry.state, mark, zero)
+    end = lax.while_loop(lambda c: eqxi.unvmap_any(c.mark >= -1), hop, begin)
     n_impacts, touching, why = _unmarked(end.mark, bits)
-    reached, full = (why == 0) & ~carry.done, (why == 1) & ~carry.done
+    reached, full, moved = free & (why == 0), free & (why == 1), n_impacts > 0
     return carry._replace(
         time=jnp.where(reached, t1, end.time),
+        ahead=end.ahead,
         state=end.state,
-        touching=touching,
-        jumped=carry.jumped | (n_impacts > 0),
-        n_impacts=n_impacts,
-        n_arcs=n_impacts + (reached | full).astype(jnp.int32),
+        window=jnp.where(moved, jnp.inf, carry.window),
+        touching=jnp.where(free, touching, carry.touching),
+        jumped=carry.jumped | moved,
+        since=jnp.where(moved, 0.0, carry.since),
+        n_impacts=carry.n_impacts + n_impacts,
+        n_arcs=carry.n_arcs + n_impacts + (reached | full).astype(jnp.int32),
+        n_at_once=jnp.where(moved, 0, carry.n_at_once),
         done=carry.done | reached | full,
         result=RESULTS.where(full, RESULTS.max_impacts, carry.result),
     )
 
 
-def _can_hop(system: AbstractSystem, motion: AbstractMotion, state: Any, max_impacts: int) -> bool:
+def can_hop(system: AbstractSystem, motion: AbstractMotion, state: Any, max_impacts: int) -> bool:
     few = (max_impacts + 2) << (system.n_contacts.bit_length() + 2) < 2**31
     return motion.is_closed_form and few and system.can_hop(state)
 
 
 def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = "lax") -> Outcome:
     """Run the loop. `kind` chooses how the loop itself may be differentiated."""
-    carry = _start(system, motion, state, t0, t1, log_rows, 0)
-    turn = lambda c: _turn(c, system, motion, t1, max_impacts)  # noqa: E731
+    carry = start(system, motion, state, t0, t1, log_rows, 0)
+    next_turn = lambda c: turn(c, system, motion, t1, max_impacts)  # noqa: E731
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
-    if kind == "hop":
-        carry = _hopped(carry, system, t1, max_impacts)
-        rest = in_tiles(lambda system, motion, t1, carry: lax.while_loop(going, lambda c: _turn(c, system, motion, t1, max_impacts), carry), motion.tile)
-        end = lax.cond(eqxi.unvmap_any(~carry.done), lambda c: rest(system, motion, t1, c), lambda c: c, carry)
+    if kind == "hop":  # by turns as far as one can hop, and one turn of what cannot
+        one = lambda c: lax.cond(eqxi.unvmap_any(~c.done), next_turn, lambda c: c, c)  # noqa: E731
+        end = lax.while_loop(going, lambda c: one(_hopped(c, system, t1, max_impacts)), carry)
     elif kind == "lax":
-        end = lax.while_loop(going, turn, carry)
+        end = lax.while_loop(going, next_turn, carry)
     else:
-        end = eqxi.while_loop(going, turn, carry, kind=kind, max_steps=motion.max_turns(max_impacts))
+        end = eqxi.while_loop(going, next_turn, carry, kind=kind, max_steps=motion.max_turns(max_impacts))
     return Outcome(end.time, end.state, end.n_impacts, end.n_arcs, end.result, end.log)
-
-
-class _Replay(NamedTuple):
-    """A motion that is repeated with derivatives."""
-
-    time: Any
-    state: Any
-    memory: Any
-    jumped: Any
-    since: Any
-    n_impacts: Any
-    values: Any  # of the log
-
-
-def _repeat(r: _Replay, steps: tuple, system, motion, t1: Any, known: _Carry) -> _Replay:
-    """The arcs of one part of a path, which the search `known` has come to the end of."""
-    log_rows = r.values.shape[0]
-    reached = known.done & (known.result == RESULTS.reached_t1)
-
-    def one(carry, step):
-        time, state, memory, jumped, since, n_impacts = carry
-        index, (size, s), (contact, code) = step
-        used = index < known.n_arcs
-        last = reached & (index == known.n_arcs - 1)
-        left = t1 - time
-        whole = jnp.where(used, jnp.where(jnp.isinf(size), left, size), 0.0)
-        begun = system.prepared(time, state)
-        piece = motion.piece(system, time, begun, memory, jumped, whole)
-        arc = piece.arc
-        crossed = used & (contact >= 0)
-        if system.n_contacts > 0:
-            (s,) = shared([jnp.where(crossed, corrected(system, arc, s, contact), s)])
-        s = jnp.where(last, arc.length, s)
-        s = jnp.where(used, s, 0.0)
-        elapsed = s * arc.unit
-        moved = jnp.where(last, t1, time + elapsed)
-        arrived = _arrays(system.advanced(moved, begun, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
-        arrived = _shared(arrived)
-        struck = crossed & (n_impacts < known.n_impacts)
-        after, until = arrived, moved
-        if system.n_contacts > 0:
-            bounced = system.bounced(contact, moved, arrived)
-            other, pause = system.impact(contact, moved, arrived, bounced, kind_of(code))
-            after = _keep(struck, _arrays(other, t1.dtype), arrived)
-            until = jnp.where(struck, moved + pause, moved)
-        row = pack_row(Row(moved, until, since + elapsed, arrived, after)) if log_rows else jnp.zeros((0,), t1.dtype)
-        carry = (
-            jnp.where(used, until, time),
-            _keep(used, after, state),
-            _keep(used, piece.memory, memory),
-            jnp.where(used, struck, jumped),
-            jnp.where(struck, 0.0, since + elapsed),
-            n_impacts + struck.astype(jnp.int32),
-        )
-        return carry, (row, jnp.where(struck, n_impacts, log_rows))
-
-    def chunk(r, steps):
-        def run(r):
-            inner, (rows, where) = lax.scan(jax.checkpoint(one, prevent_cse=False), tuple(r[:-1]), steps)
-            return _Replay(*inner, r.values.at[where].set(rows, mode="drop") if log_rows else r.values)
-
-        return lax.cond(eqxi.unvmap_any(steps[0][0] < known.n_arcs), run, lambda r: r, r), None
-
-    return lax.scan(chunk, r, steps)[0]
-
-
-def _resumed(system, motion, t1, carry: _Carry, stop: Any, max_impacts: int) -> _Carry:
-    """The loop, as far as every lane has ended or gone through `stop` arcs."""
-
-    def turn(state):
-        c, ended = state
-        paused = c.n_arcs >= stop
-        c = _turn(c._replace(done=ended | paused), system, motion, t1, max_impacts)
-        return c, ended | (c.done & ~paused)
-
-    going = lambda state: eqxi.unvmap_any(~state[1] & (state[0].n_arcs < stop))  # noqa: E731
-    carry, ended = lax.while_loop(going, turn, (carry, carry.done))
-    return carry._replace(done=ended)
-
-
-def replay(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int) -> Outcome:
-    """The motion with derivatives. By turns a part of the path is found without them and repeated with them, so that
-    only one part at a time is in memory."""
-    still = frozen((system, motion))
-    chunks = -(-motion.max_pieces(max_impacts) // _CHUNK)
-    size = -(-motion.max_pieces(max_impacts) // chunks)  # equal chunks, none of which is mostly padding
-    per_part = min(chunks, _CHUNKS_AT_ONCE)
-    rows = size * per_part
-    begin = _start(*still, *frozen((state, t0, t1)), log_rows, rows)
-    moves = ~begin.done  # a lane that cannot start computes harmless numbers, and gives back what was found
-    state = jax.tree.map(lambda x: jnp.where(moves, x, 1.0), _arrays(state, t0.dtype))
-    t0, t1 = (jnp.where(moves, t, 0.0) for t in (t0, t1))
-    _, memory = motion.begin(system, t0, state, t1)
-    end = frozen(t1)
-    values = jnp.where(jnp.isnan(begin.log.values), 0.0, begin.log.values)
-
-    def part(both, first):
-        def run(both):
-            search, r = both
-            empty = jax.tree.map(jnp.zeros_like, search.path.sizes), jnp.full_like(search.path.labels, -1)
-            resume = lambda system, motion, t1, c, stop: _resumed(system, motion, t1, c, stop, max_impacts)  # noqa: E731
-            search = in_tiles(resume, motion.tile)(*still, end, search._replace(path=Path(*empty)), first + rows)
-            search = frozen(search)
-            index = first + jnp.arange(rows, dtype=jnp.int32)
-            steps = jax.tree.map(lambda x: x.reshape(per_part, size, *x.shape[1:]), (index, *search.path))
-            steps = (steps[0], *[(pair[..., 0], pair[..., 1]) for pair in steps[1:]])
-            return search, _repeat(r, steps, system, motion, t1, search)
-
-        return lax.cond(eqxi.unvmap_any(~both[0].done), run, lambda both: both, both), None
-
-    zero = jnp.asarray(0, dtype=jnp.int32)
-    r = _Replay(t0, state, memory, jnp.asarray(True), jnp.zeros_like(t0), zero, values)
-    firsts = rows * jnp.arange(-(-chunks // per_part), dtype=jnp.int32)
-    body = part if firsts.size == 1 else jax.checkpoint(part, prevent_cse=False)
-    (search, r), _ = lax.scan(body, (begin, r), firsts)
-    time, state = _keep(moves, (r.time, r.state), (search.time, search.state))
-    log = Log(jnp.where(jnp.isnan(search.log.values), search.log.values, r.values), search.log.labels)
-    return Outcome(time, state, search.n_impacts, search.n_arcs, search.result, log)
-
-
-def _find(system, motion, state, t0, t1, **options):
-    """`find`, not differentiated, and in tiles where it is batched."""
-    primals = frozen((system, motion, state, t0, t1))
-    if options["log_rows"] == 0 and _can_hop(system, motion, state, options["max_impacts"]):
-        return _find_by_hops(*primals, **options)
-    return in_tiles(lambda *primals: find(*primals, **options), motion.tile)(*primals)
-
-
-def _find_by_hops(system, motion, state, t0, t1, **options):
-    """The same. Hops are so quick that reading and writing counts: what passes into a tile and out of it is the user's
-    form of a state, few arrays instead of many."""
-
-    def part(system, motion, user, phase, t0, t1):
-        outcome = find(system, motion, system.unpacked(user, phase), t0, t1, kind="hop", **options)
-        return outcome._replace(state=(system.packed(outcome.state), system.phase(outcome.state)))
-
-    given = (system, motion, system.packed(_arrays(state, t0.dtype)), system.phase(state), t0, t1)
-    outcome = in_tiles(part, _HOP_TILE)(*given)
-    return outcome._replace(state=system.unpacked(*outcome.state))
-
-
-@eqx.filter_custom_jvp
-def _find_or_replay(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int):
-    return _find(system, motion, state, t0, t1, max_impacts=max_impacts, log_rows=log_rows)
-
-
-@_find_or_replay.def_jvp
-def _find_or_replay_jvp(primals, tangents, *, max_impacts: int, log_rows: int):
-    options = {"max_impacts": max_impacts, "log_rows": log_rows}
-    return eqx.filter_jvp(lambda *primals: replay(*primals, **options), primals, tangents)
-
-
-def run(
-    system: AbstractSystem,
-    motion: AbstractMotion,
-    state: Any,
-    t0: Any,
-    t1: Any,
-    *,
-    max_impacts: int,
-    log_rows: int,
-    adjoint: Any = None,
-) -> Outcome:
-    """Move a system from t0 to t1 through its impacts, differentiably; see `simulate`."""
-    options: dict[str, Any] = {"max_impacts": max_impacts, "log_rows": log_rows}
-    if adjoint is None:
-        return _find_or_replay(system, motion, state, t0, t1, **options)
-    if isinstance(adjoint, diffrax.ForwardMode):
-        return find(system, motion, state, t0, t1, **options)[0]
-    if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        return find(system, motion, state, t0, t1, kind="checkpointed", **options)[0]
-    raise ValueError(
-        "Argument `adjoint` must be None, diffrax.ForwardMode() or diffrax.RecursiveCheckpointAdjoint(), but got "
-        f"{adjoint}; try None, which serves both modes."
-    )

@@ -13,7 +13,7 @@ from jax import lax
 from ._air import Air
 from ._ball import Ball, BallState, check_ball_state
 from ._corner import collide_with_all, is_one_mu
-from ._hops import Hop, Wall, hop
+from ._hops import Wall, hop
 from ._polynomial import Window
 from ._rotation import turned
 from ._shared import shared
@@ -200,14 +200,14 @@ class Scene(AbstractSystem):
     def hop(self, touching, going, full, left, state, dies_out=None):
         """A parabola from plane to plane; `dies_out(i, speed, left)` says whether bounces may end after an impact."""
         g, x = components(self.gravity), state.position
-        walls, floor = [], (0.0, 0.0, 0.0)
+        walls, floor, zero = [], (0.0, 0.0, 0.0), jnp.zeros_like(left)
         for i, surface in enumerate(self.surfaces):
             n = surface.direction(x, 0.0)
             noise = rounding(self, i, x)
-            walls.append(Wall(n, self.level(i, 0.0, x, state), dot(n, state.velocity), times(0.5, dot(n, g)), noise))
+            walls.append(Wall(n, self.level(i, zero, x, state), dot(n, state.velocity), times(0.5, dot(n, g)), noise))
 
         def room(i, j):
-            levels = [self.level(k, 0.0, floor, state) for k in (i, j)]
+            levels = [self.level(k, zero, floor, state) for k in (i, j)]
             return ratio(plus(*levels), plus(abs(levels[0]), plus(abs(levels[1]), self.ball.radius)))
 
         def kicked(choice, velocity, spin):
@@ -216,7 +216,8 @@ class Scene(AbstractSystem):
 
         parts = (touching, going, full, left, (x, state.velocity, state.spin))
         done = hop(walls, room, g, kicked, dies_out or (lambda *_: None), *parts)
-        return done._replace(state=Flight(*done.state, None))
+        position, velocity, spin = done.state
+        return done._replace(state=Flight(position, velocity, spin, None))
 
     def level(self, contact, time, q, state):
         return self.surfaces[contact].level(q, time, self.ball.radius)

@@ -1,10 +1,10 @@
 """Numbers that are computed once.
 
 XLA's fusion on the CPU copies whatever is cheap into all of its consumers, and these into theirs, so that a chain of
-stages is computed anew for every output, and compiled anew. From JAX 0.12 on, `lax.optimization_barrier` prevents that;
-before, it is gone when fusion begins, but a division is never copied. A division written in JAX turns into a
-multiplication in derivatives, where its divisor has fewer axes. Hence a primitive of its own, the identity, that becomes
-a barrier or a division only when the program is lowered.
+stages is computed anew for every output, and compiled anew. From JAX 0.12 on, `lax.optimization_barrier` prevents
+that; before, it is gone when fusion begins, but a division is never copied. A division written in JAX turns into a
+multiplication in derivatives, where its divisor has fewer axes. Hence a primitive of its own, the identity, that
+becomes a barrier or a division only when the program is lowered.
 """
 
 from collections.abc import Sequence

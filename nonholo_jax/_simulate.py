@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from ._accuracy import motion_for
 from ._floors import slides_across
 from ._grounded import grounded
-from ._loop import run
 from ._motion import AbstractMotion, Exact
 from ._motion_integrated import Integrated
+from ._replay import run
 from ._scene import Scene
 from ._system import AbstractSystem
 from ._tiles import free_devices, over_devices
@@ -112,8 +112,8 @@ def simulate_batch(
     - `log_size`: the log of a large batch is most of its memory and time; 0 if only the final states are wanted.
     - `throw`: False by default: one failed lane must not lose a batch. Each lane has its own `Trajectory.result`.
 
-    Returns a `Trajectory` with a leading axis N. The batch is spread over all devices of the process, unless it is called
-    within a transformation or somebody has put an argument on a device.
+    Returns a `Trajectory` with a leading axis N. The batch is spread over all devices of the process, unless this is
+    called within a transformation or somebody has put an argument on a device.
 
     ```python
     import jax, jax.numpy as jnp

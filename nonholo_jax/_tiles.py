@@ -7,6 +7,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -45,11 +46,16 @@ def _in_turn(whole: Callable, lanes: Any, n: int, size: int) -> Any:
     """`whole` on tiles of `size` lanes, one after the other; the last tile is filled up with the last lane."""
     n_tiles, padding = -(-n // size), -n % size
     tiles = jax.tree.map(
-        lambda x: jnp.pad(x, ((0, padding), *[(0, 0)] * (x.ndim - 1)), mode="edge").reshape(n_tiles, size, *x.shape[1:]),
+        lambda x: _filled(x, padding).reshape(n_tiles, size, *x.shape[1:]),
         lanes,
     )
     out = lax.map(whole, tiles)
     return jax.tree.map(lambda x: x.reshape(x.shape[0] * size, *x.shape[2:])[:n], out)
+
+
+def _filled(x: Any, padding: int) -> Any:
+    """With the last lane so many times more."""
+    return jnp.pad(x, ((0, padding), *[(0, 0)] * (x.ndim - 1)), mode="edge")
 
 
 def free_devices(args: Any) -> int:
@@ -71,7 +77,7 @@ def over_devices(function: Callable, lanes: Any, rest: Any, count: int) -> Any:
         return function(lanes, rest)
     mesh, spec = Mesh(np.array(jax.local_devices()[:count]), ("lanes",)), PartitionSpec("lanes")
     padding = -n % count
-    lanes = jax.tree.map(lambda x: jnp.pad(x, ((0, padding), *[(0, 0)] * (x.ndim - 1)), mode="edge"), lanes)
+    lanes = jax.tree.map(lambda x: _filled(x, padding), lanes)
     options = {"in_specs": (spec, PartitionSpec()), "out_specs": spec, "check_vma": False}
     out = jax.shard_map(function, mesh=mesh, **options)(lanes, rest)
     return jax.tree.map(lambda x: x[:n], out) if padding else out

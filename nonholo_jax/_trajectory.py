@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._loop import Outcome, kind_of, run, unpack_row
+from ._loop import Outcome, kind_of, unpack_row
 from ._motion import AbstractMotion
+from ._replay import run
 from ._system import AbstractSystem
 from ._types import KINDS, RESULTS
 from ._vector import frozen

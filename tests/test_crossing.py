@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from helpers import BALL, GRAVITY, all_surfaces, arrays, generator, lane, named, results_of, scene_of, states, throws
 
-from nonholo_jax import Ball, Box, Cylinder, Exact, Plane, Rough, Scene, Smooth, Sphere, simulate_batch
+from nonholo_jax import Ball, BallState, Box, Cylinder, Exact, Plane, Rough, Scene, Smooth, Sphere, simulate_batch
 
 mpmath.mp.dps = 40
 dtypes = pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -396,3 +396,22 @@ def test_gap_level_and_normal_belong_together(case, getkey):
     assert implicit or np.abs(length - 1).max() < 1e-13
     np.testing.assert_allclose(normal, slope / length, rtol=0, atol=1e-12)
     np.testing.assert_allclose(steep, slope, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [1e-6, 1e-9, 1e-12])
+def test_derivatives_of_a_grazing_throw_at_a_plane(angle):
+    """At a plane the rate is known to the rounding of the velocity. It was not trusted below sqrt(eps) of the speed:
+    the time then had no derivatives, and those of the height after the impact had the wrong sign."""
+    scene = Scene(Ball(0.1, 1.0), {"floor": Plane(ZERO, (0.0, 0.0, 1.0), Smooth())}, gravity=(0.0, 0.0, 0.0))
+
+    def height(throw):
+        z, v = throw
+        return simulate_batch(scene, states_of(z, v), t1=1.0, max_impacts=2, log_size=0).final.position[0, 2]
+
+    def states_of(z, v):
+        like = lambda *x: jnp.stack(x)[None]  # noqa: E731
+        return BallState(like(0 * z, 0 * z, z), like(z / z, 0 * z, v), like(0 * z, 0 * z, 0 * z))
+
+    throw = (jnp.asarray(0.1 + 0.5 * angle), jnp.asarray(-angle))
+    for mode in (jax.jacfwd, jax.jacrev):  # z(1 s) = 2 r - z - v: the image of the straight path
+        np.testing.assert_allclose(mode(height)(throw), (-1.0, -1.0), rtol=1e-3)

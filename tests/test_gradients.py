@@ -434,3 +434,20 @@ def test_motion_may_be_chosen_by_default():
     state = lane(throws(PLANE, jax.random.key(0), 1), 0)
     assert isinstance(simulate(scene_of(PLANE, Rough()), state, t1=0.1).motion, Exact)
     assert isinstance(simulate(scene_of(PLANE, Rough(), air=AIR), state, t1=0.1).motion, Integrated)
+
+
+@pytest.mark.parametrize("adjoint", [diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()])
+def test_derivatives_of_the_loop_itself_through_bounces_on_one_plane(adjoint):
+    """The search finds the return to a plane from the velocity alone, with a level of zero there: derivatives of the
+    loop took that for a constant, and were wrong from the second bounce on."""
+    scene = Scene(Ball(0.1, 1.0), {"floor": Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Rough())})
+
+    def height(speed, adjoint=adjoint):
+        throw = BallState(jnp.stack([0 * speed, 0 * speed, 0.3 + 0 * speed]), jnp.stack([0 * speed, 0 * speed, speed]),
+                          jnp.zeros(3))  # fmt: skip
+        return simulate(scene, throw, t1=3.3, max_impacts=8, log_size=0, adjoint=adjoint, throw=False).final.position[2]
+
+    mode = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.jacrev
+    speed, step = jnp.asarray(2.0), 1e-6
+    expected = (height(speed + step, None) - height(speed - step, None)) / (2 * step)
+    np.testing.assert_allclose(mode(height)(speed), expected, rtol=1e-6)

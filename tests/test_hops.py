@@ -1,5 +1,5 @@
-"""Hops, from plane to plane in closed form, are the event loop: the same impacts, to rounding, and the same results; and
-where there is more to do than an ordinary bounce they leave it to the loop."""
+"""Hops, from plane to plane in closed form, are the event loop: the same impacts, to rounding, and the same results;
+and where there is more to do than an ordinary bounce they leave it to the loop."""
 
 import jax
 import jax.numpy as jnp
@@ -142,7 +142,7 @@ def test_marks_can_be_read_back():
 
 
 def test_the_program_has_no_search():
-    """Where the scene is planes and no log is kept, the loop that hops comes first, and the search waits under a cond."""
+    """Where the scene is planes and no log is kept, there is one loop more, which hops, within another."""
     room = scene("elastic", ("floor",))
     state = BallState([0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     run = lambda size: str(jax.make_jaxpr(lambda s: simulate(room, s, t1=1.0, log_size=size, throw=False))(state))  # noqa: E731

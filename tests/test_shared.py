@@ -1,5 +1,5 @@
-"""`shared` is the identity in every derivative, and in the program of a CPU what XLA does not copy: a barrier, or, before
-JAX 0.12, a division."""
+"""`shared` is the identity in every derivative, and in the program of a CPU what XLA does not copy: a barrier, or,
+before JAX 0.12, a division."""
 
 import jax
 import jax.numpy as jnp

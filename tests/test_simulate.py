@@ -473,3 +473,15 @@ def test_gravity_is_used():
     assert np.allclose(GRAVITY, [0, 0, -9.81])
     fall = simulate(Scene(Ball(R, 1.0), {}), BallState([0.0, 0, 0], [0.0, 0, 0], [0.0, 0, 0]), t1=2.0).final
     np.testing.assert_allclose(fall.position, [0, 0, -9.81 * 2], rtol=1e-15)
+
+
+def test_time_does_not_drift_with_the_number_of_bounces():
+    """Bounces of one height round the time all in the same way: in float32 a ball was 0.2 % of its bounces ahead after
+    a million of them, in float64 0.1 ms late."""
+    height = np.float32(R + 9.81 / 8)  # a period of one second, but for rounding
+    drop = states([0.0, 0.0, height], STILL, STILL, np.float32)
+    end = simulate(SCENE, drop, t1=1e5, max_impacts=100_001, log_size=0)
+    period = 2.0 * np.sqrt(2.0 * (float(height) - R) / float(np.float32(9.81)))
+    assert int(end.n_impacts) == int(1e5 / period + 0.5)
+    since = (1e5 + 0.5 * period) % period  # since the last impact
+    assert abs(float(end.final.position[2]) - (R + 9.81 / 2 * since * (period - since))) < 0.05
