@@ -4,6 +4,7 @@ One flat loop: a turn searches one arc for its first crossing and finishes it wi
 arc; lanes of a batch are each in their own bounce. Where the system knows its next impact in closed form it hops.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -213,17 +214,14 @@ def turn(c: Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, max_
     place = c.n_arcs % max(c.path.labels.shape[0], 1)
     path = _written(c.path, place, ended & ~c.done, sizes, jnp.stack([found.contact, labels[1]]))
 
-    result = RESULTS.where(crossed & full, RESULTS.max_impacts, c.result)
-    result = RESULTS.where(crossed & stuck, RESULTS.corner, result)
-    result = RESULTS.where(crossed & failed, fault, result)
-    result = RESULTS.where(settled, RESULTS.at_rest, result)
     broken = ended & ~jnp.isfinite(time + sum(arrived_leaf.sum() for arrived_leaf in jax.tree.leaves(arrived)))
     (broken,) = _shared_flags((broken,))
-    result = RESULTS.where(broken, RESULTS.invalid_state, result)
     n_arcs = c.n_arcs + ended.astype(jnp.int32)
     exhausted = (c.n_turns + 1 >= motion.max_turns(max_impacts)) | (n_arcs >= motion.max_pieces(max_impacts))
     exhausted = exhausted & ~(reached | stopped | settled | broken)
-    result = RESULTS.where(exhausted, RESULTS.step_limit, result)
+    cases = [(crossed & full, RESULTS.max_impacts), (crossed & stuck, RESULTS.corner), (crossed & failed, fault),
+             (settled, RESULTS.at_rest), (broken, RESULTS.invalid_state), (exhausted, RESULTS.step_limit)]  # fmt: skip
+    result = functools.reduce(lambda result, case: RESULTS.where(*case, result), cases, c.result)
     new = c._replace(
         time=jnp.where(struck, until, jnp.where(ended, time, c.time)),
         ahead=jnp.where(ended, ahead, c.ahead),
