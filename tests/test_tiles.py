@@ -1,5 +1,9 @@
 """A batch that runs in tiles is the batch that runs at once, whatever its size, and lane by lane the single motion."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,3 +64,36 @@ def test_scene_parameters_in_tiles(getkey):
 
     single = jax.vmap(one)(restitution, state)
     assert np.allclose(stacked(batch.final), stacked(single.final), rtol=0, atol=1e-14)
+
+
+DEVICES = """
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+from nonholo_jax import Ball, BallState, Plane, Rough, Scene, simulate_batch
+n = 5
+restitution = jnp.linspace(0.5, 1.0, n)
+scene = Scene(Ball(0.1, 1.0), {"floor": Plane((0, 0, 0), (0, 0, 1), Rough(restitution))})
+spin = jnp.arange(3.0 * n).reshape(n, 3)
+states = BallState(jnp.ones((n, 3)), jnp.ones((n, 3)), spin)
+options = {"t1": jnp.asarray(1.0), "scene_axes": 0, "max_impacts": 3}
+spread = simulate_batch(scene, states, **options)
+first = jax.devices()[0]
+alone = simulate_batch(scene, jax.device_put(states, first), **options)
+inside = jax.jit(lambda states: simulate_batch(scene, states, **options))(states)
+counts = [len(each.final.position.sharding.device_set) for each in (spread, alone, inside)]
+assert counts[1:] == [1, 1], counts
+for other in (alone, inside):
+    for a, b in zip(jax.tree.leaves(spread), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-13, atol=1e-15)
+print("shared by", counts[0], jax.device_count())
+"""
+
+
+def test_devices_share_a_batch():
+    """Over two devices of a process of its own, an odd number of lanes; but not where a device was chosen, nor within a
+    transformation. The answer is the same."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    environment = {**os.environ, "XLA_FLAGS": flags}
+    done = subprocess.run([sys.executable, "-c", DEVICES], capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["shared", "by", "2", "2"]
