@@ -244,6 +244,8 @@ def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Index) -> Sc
     known = s = frozen(s)
     returns = select(contact, [jnp.where(_returns(system, i, arc, s), 1.0, 0.0) for i in range(system.n_contacts)])
     noise = select(contact, [_noise(system, i, arc) for i in range(system.n_contacts)])
+    # An arc that nothing cuts keeps its s: a Newton step to nowhere could overflow, and its derivative with it.
+    noise = jnp.where(contact >= 0, noise, jnp.inf)
     for _ in range(2):
         q, tangent = arc.position(s), arc.tangent(s)
         pairs = [

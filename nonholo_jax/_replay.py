@@ -214,9 +214,9 @@ def run(
     if adjoint is None:
         return _find_or_replay(system, motion, state, t0, t1, **options)
     if isinstance(adjoint, diffrax.ForwardMode):
-        return find(system, motion, state, t0, t1, **options)[0]
+        return find(system, motion, state, t0, t1, **options)
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        return find(system, motion, state, t0, t1, kind="checkpointed", **options)[0]
+        return find(system, motion, state, t0, t1, kind="checkpointed", **options)
     raise ValueError(
         "Argument `adjoint` must be None, diffrax.ForwardMode() or diffrax.RecursiveCheckpointAdjoint(), but got "
         f"{adjoint}; try None, which serves both modes."
