@@ -48,7 +48,8 @@ def throws(n: int, orientation: bool = False) -> BallState:
     position = rng.uniform(-0.3, 0.3, (n, 3)) + [0.0, 0.0, 0.4]
     parts = position, rng.uniform(-1.0, 1.0, (n, 3)), 50.0 * rng.standard_normal((n, 3))
     turned = jnp.tile(jnp.array([[1.0, 0.0, 0.0, 0.0]]), (n, 1)) if orientation else None
-    return BallState(*(jnp.asarray(part) for part in parts), turned)
+    position, velocity, spin = (jnp.asarray(part) for part in parts)
+    return BallState(position, velocity, spin, turned)
 
 
 def scene(n_walls: int = 0, law: Any = None, table: bool = False, **options) -> Scene:
@@ -60,7 +61,7 @@ def scene(n_walls: int = 0, law: Any = None, table: bool = False, **options) -> 
         out = (float(np.cos(angle)), float(np.sin(angle)), 0.0)
         surfaces[f"wall{i}"] = Plane(tuple(20.0 * c for c in out), tuple(-c for c in out), law)
     if table:
-        surfaces["table"] = Box((5.0, 0.0, 0.7), (0.6, 0.4, 0.015), law)
+        surfaces["table"] = Box(center=(5.0, 0.0, 0.7), half_size=(0.6, 0.4, 0.015), law=law)
     return Scene(BALL, surfaces, **options)
 
 
@@ -145,7 +146,7 @@ def main() -> None:
     print(f"by hand and floor agree to {np.abs(exact['by hand'] - exact['floor']).max():.1e} m")
     base = timed["floor"][1]
     for name, (way, states) in ways(options.throws).items():
-        text = jax.jit(way).lower(states).compile().as_text()
+        text = jax.jit(way).lower(states).compile().as_text() or ""
         compiling, median, spread = timed[name]
         inside = [what for what, file in CODE.items() if file in text]
         values = {"operations": operations(text), "seconds": median / options.throws, "contains": inside}
