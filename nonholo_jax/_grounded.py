@@ -451,18 +451,15 @@ class Grounded(AbstractSystem):
 
     # Where nothing settles
 
-    def can_hop(self, state):
-        return self.scene.can_hop(state.flight) and not self._floors.have_edges
+    def hopper(self, state):
+        return None if self.scene.hopper(state.flight) is None else self._hop
 
-    def hop(self, touching, going, full, left, state):
-        laws = {i: self.scene.surfaces[i].law for i in self._floors.indices}
-        normals = [surface.direction(state.flight.position, 0.0) for surface in self.scene.surfaces]
-
-        def dies_out(i, speed, left):
+    def _hop(self, touching, going, full, left, state):
+        def dies_out(i, wall, speed, left):
             """`train.duration` is at most `left`, or nearly, without its divisions."""
-            if i not in laws:
-                return None
-            e, pull = laws[i].restitution, times(-1.0, dot(normals[i], components(self.scene.gravity)))
+            if i not in self._floors.indices:
+                return False
+            e, pull = self.scene.surfaces[i].law.restitution, times(-2.0, wall.pull)
             return jnp.asarray(pull > 0) & (times(2.0 * e, speed) <= 1.001 * left * times(pull, 1.0 - e))
 
         done = self.scene.hop(touching, going, full, left, state.flight, dies_out)

@@ -33,7 +33,8 @@ class Wall(NamedTuple):
     gap: Any
     rate: Any
     pull: Number  # half the acceleration of the gap
-    noise: Number  # a distance well above the rounding of the gap
+    noise: Number  # the rounding of the gap
+    origin: Number  # the gap of a ball at the origin, which is a constant where the plane is one
 
 
 def _times_to(wall: Wall, left_behind: Any) -> Any:
@@ -57,15 +58,16 @@ def _positive(x: Number) -> Number:
     return x if is_constant(x) and x > 0 else jnp.where(jnp.asarray(x > 0), x, 1.0)
 
 
-def _are_apart(a: Wall, b: Wall, room: Number) -> bool:
+def _are_apart(a: Wall, b: Wall) -> bool:
     """Whether two planes are known to face each other at a distance, so that no ball touches both."""
-    known = all(is_constant(c) for c in (*a.normal, *b.normal, room))
-    return known and all(x == -y for x, y in zip(a.normal, b.normal, strict=True)) and bool(room > 1e-3)
+    if not all(is_constant(c) for c in (*a.normal, *b.normal, a.origin, b.origin)):
+        return False
+    faces = all(x == -y for x, y in zip(a.normal, b.normal, strict=True))
+    return faces and bool(a.origin + b.origin > 1e-3 * (abs(a.origin) + abs(b.origin)))
 
 
 def hop(
     walls: Sequence[Wall],
-    rooms: Callable[[int, int], Number],
     gravity: Vector3,
     kicked: Callable,
     dies_out: Callable,
@@ -77,9 +79,8 @@ def hop(
 ) -> Hop:
     """One hop of a ball.
 
-    **Arguments:** `rooms(i, j)`: the distance between two planes that face each other, less the ball, relative to the
-    size of the scene; `kicked(choice, velocity, spin)`: the velocities after an impact; `dies_out(i, speed, left)`:
-    whether bounces may die out after an impact of that normal speed.
+    **Arguments:** `kicked(choice, velocity, spin)`: the velocities after an impact; `dies_out(i, wall, speed, left)`:
+    whether bounces may die out after an impact of that normal speed; the rest as in `AbstractSystem.hopper`.
     """
     steps = shared([_times_to(wall, touching == i) for i, wall in enumerate(walls)])
     h, which = steps[0], jnp.zeros_like(left)
@@ -89,12 +90,11 @@ def hop(
     hits, hops = h <= left, jnp.isfinite(left) & (h >= 0)
     for i, wall in enumerate(walls):
         there = (which == i) & hits
-        near = [j for j, other in enumerate(walls) if j != i and not _are_apart(wall, other, rooms(i, j))]
-        for j in near:
-            gap = walls[j].gap + h * (walls[j].rate + walls[j].pull * h)
-            hops = hops & ~(there & (gap <= 32.0 * walls[j].noise))
-        ends = dies_out(i, -(wall.rate + 2.0 * wall.pull * h), left - h)
-        hops = hops if ends is None else hops & ~(there & ends)
+        unusual = dies_out(i, wall, -(wall.rate + 2.0 * wall.pull * h), left - h)
+        for other in walls:
+            if other is not wall and not _are_apart(wall, other):
+                unusual = unusual | (other.gap + h * (other.rate + other.pull * h) <= 32.0 * other.noise)
+        hops = hops if unusual is False else hops & ~(there & unusual)
     choice = jnp.where(hops, jnp.where(hits, jnp.where(full, FULL, which), ENDS), PAUSES)
     duration = jnp.where(going & hops, jnp.minimum(h, left), 0.0)
     choice = jnp.where(going, choice, PAUSES)

@@ -350,6 +350,9 @@ class LagrangianSystem(AbstractSystem):
         gradients = jnp.stack([jnp.stack(gradient_of(each.gap, components(state[0]))) for each in self.barriers])
         return state[0], gradients[contact]
 
+    def hopper(self, state):
+        return None
+
     def without_contacts(self) -> "LagrangianSystem":
         return eqx.tree_at(lambda system: system.barriers, self, ())
 

@@ -297,12 +297,12 @@ def _unmarked(mark: Any, bits: int) -> tuple:
 def _hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int) -> Carry:
     """The motion as far as it is a row of ordinary impacts, known in closed form. All lanes that hop are at the same
     impact, so that the number of turns counts their impacts."""
-
-    bits, left = system.n_contacts.bit_length(), max_impacts - carry.n_impacts
+    bits, hopper = system.n_contacts.bit_length(), system.hopper(carry.state)
+    assert hopper is not None
 
     def hop(c: _Hopping) -> _Hopping:
-        going = c.mark >= -1
-        done = system.hop(c.mark, going, c.turn >= left, t1 - c.time + c.ahead, c.state)
+        going, full = c.mark >= -1, c.turn >= max_impacts - carry.n_impacts
+        done = hopper(c.mark, going, full, t1 - c.time + c.ahead, c.state)
         why = jnp.where(done.choice == ENDS, 0, jnp.where(done.choice == FULL, 1, 2))
         stop = _stopped(c.turn, jnp.maximum(c.mark, -1), why, bits)
         mark = jnp.where(done.choice >= 0, done.choice.astype(jnp.int32), jnp.where(going, stop, c.mark))
@@ -334,11 +334,12 @@ def _hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int) -> 
 
 def can_hop(system: AbstractSystem, motion: AbstractMotion, state: Any, max_impacts: int) -> bool:
     few = (max_impacts + 2) << (system.n_contacts.bit_length() + 2) < 2**31
-    return motion.is_closed_form and few and system.can_hop(state)
+    return motion.is_closed_form and few and system.hopper(state) is not None
 
 
 def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = "lax") -> Outcome:
-    """Run the loop. `kind` chooses how the loop itself may be differentiated."""
+    """Run the loop. `kind` chooses how the loop itself may be differentiated: "lax" forward, "checkpointed" in reverse,
+    and "hop", quicker where the system can hop, not at all."""
     carry = start(system, motion, state, t0, t1, log_rows, 0)
     next_turn = lambda c: turn(c, system, motion, t1, max_impacts)  # noqa: E731
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731

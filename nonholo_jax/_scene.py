@@ -193,29 +193,27 @@ class Scene(AbstractSystem):
         twist = times(s, ratio(1.0, times(ball.inertia_ratio, ball.radius)))
         return subtract(velocity, kick), add(spin, scale(twist, cross(n, tuple(slip))))
 
-    def can_hop(self, state):
+    def hopper(self, state):
         flat = len(self.surfaces) > 0 and all(type(surface) is Plane for surface in self.surfaces)
-        return flat and self.air is None and state.orientation is None
+        return self.hop if flat and self.air is None and state.orientation is None else None
 
-    def hop(self, touching, going, full, left, state, dies_out=None):
-        """A parabola from plane to plane; `dies_out(i, speed, left)` says whether bounces may end after an impact."""
+    def hop(self, touching, going, full, left, state, dies_out=lambda *_: False):
+        """A parabola from plane to plane; `dies_out(i, wall, speed, left)` says whether bounces may end after an
+        impact."""
         g, x = components(self.gravity), state.position
-        walls, floor, zero = [], (0.0, 0.0, 0.0), jnp.zeros_like(left)
+        walls, origin, zero = [], (0.0, 0.0, 0.0), jnp.zeros_like(left)
         for i, surface in enumerate(self.surfaces):
             n = surface.direction(x, 0.0)
-            noise = rounding(self, i, x)
-            walls.append(Wall(n, self.level(i, zero, x, state), dot(n, state.velocity), times(0.5, dot(n, g)), noise))
-
-        def room(i, j):
-            levels = [self.level(k, zero, floor, state) for k in (i, j)]
-            return ratio(plus(*levels), plus(abs(levels[0]), plus(abs(levels[1]), self.ball.radius)))
+            gap, there = (self.level(i, zero, place, state) for place in (x, origin))
+            walls.append(Wall(n, gap, dot(n, state.velocity), times(0.5, dot(n, g)), rounding(self, i, x), there))
 
         def kicked(choice, velocity, spin):
             n = select_vector(choice, [wall.normal for wall in walls])
+            # Only the slip is shared: each number more is one more pass over the batch.
             return self._after(choice, n, velocity, spin, lambda x: (x[0], *shared(x[1:])) if len(x) > 2 else x)
 
         parts = (touching, going, full, left, (x, state.velocity, state.spin))
-        done = hop(walls, room, g, kicked, dies_out or (lambda *_: None), *parts)
+        done = hop(walls, g, kicked, dies_out, *parts)
         position, velocity, spin = done.state
         return done._replace(state=Flight(position, velocity, spin, None))
 

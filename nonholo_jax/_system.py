@@ -1,7 +1,7 @@
 """What the event loop asks of a mechanical system."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -119,15 +119,12 @@ class AbstractSystem(eqx.Module):
     def contact_frame(self, contact: Index, time: Scalar, state: Any) -> tuple[Array, Array]:
         """The point of contact and the gradient of the gap there."""
 
-    def can_hop(self, state: Any) -> bool:
-        """Whether the next impact is known in closed form, so that `hop` serves until something unusual happens."""
-        del state
-        return False
-
-    def hop(self, touching: Any, going: Any, full: Any, left: Scalar, state: Any) -> Any:
-        """One arc and the impact that ends it, or, where not `going`, nothing: a `Hop`. `touching` is the contact that
-        was left last, `full` says that there may be no further impact, `left` how many seconds are left."""
-        raise NotImplementedError
+    @abstractmethod
+    def hopper(self, state: Any) -> Callable | None:
+        """Where the next impact is known in closed form, until something unusual happens: a function
+        `hop(touching, going, full, left, state)` that makes one arc and the impact that ends it, or, where not `going`,
+        nothing: a `Hop`. `touching` is the contact that was left last, `full` says that there may be no further impact,
+        `left` how many seconds are left. Elsewhere `None`."""
 
     @abstractmethod
     def without_contacts(self) -> "AbstractSystem":
