@@ -17,9 +17,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from bench_throughput import by_turns
 from jax import lax
 from report import machine
+from throughput_shared import by_turns
 
 from nonholo_jax import (
     Air,
