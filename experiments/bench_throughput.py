@@ -1,10 +1,11 @@
 """How many bounces a second, beside C programs; gradients beside values; scaling.
 
 Sections: `limit`, floor and ceiling, elastic, 64 impacts of each throw, beside bounces.c, on one device and on all;
-`table`, throws under a table, a Box, beside table.c; `gradient`, a scalar of the end against that and its gradient in
-nine inputs, 16 impacts; `scaling`, with batch size, impacts and surfaces, with compilation time beside it. The C
-programs are compiled here (-O3, OpenMP, state in registers). All ways of a section run by turns, medians after
-compilation.
+`table`, throws under a table, a Box, beside table.c; `integrated`, throws with air, beside `diffrax.diffeqsolve`
+restarted at every bounce and runge_kutta.c, at equal median error; `gradient`, a scalar of the end against that and its
+gradient in nine inputs, 16 impacts; `scaling`, with batch size, impacts and surfaces, with compilation time beside it.
+The C programs are compiled here (-O3, OpenMP, state in registers). All ways of a section run by turns, medians after
+compilation, each way as often in a turn as takes 50 ms.
 
     python experiments/bench_throughput.py [--sections limit,table] [--throws 1048576] [--runs 5] [--json FILE]
 """
@@ -20,6 +21,7 @@ import jax
 from report import machine
 from throughput_bounces import limit, table
 from throughput_gradient import gradient
+from throughput_integrated import integrated
 from throughput_scaling import scaling
 
 
@@ -31,6 +33,7 @@ class Section(NamedTuple):
 SECTIONS = {
     "limit": Section(limit),
     "table": Section(table, 16),
+    "integrated": Section(integrated, 64),
     "gradient": Section(gradient, 64),
     "scaling": Section(scaling),
 }
@@ -40,6 +43,9 @@ def printed(rows: list[dict]) -> None:
     for r in rows:
         extra = f"  {r['of_c']:.3f} of C" if "of_c" in r else ""
         extra += f"  {r['times_value']:.1f} x value" if "times_value" in r else ""
+        extra += f"  {r['times_restarted']:.1f} x restarted" if "times_restarted" in r else ""
+        if "median_error" in r:
+            extra += f"  median error {r['median_error']:.1e} m, tolerance {r['tolerance']:.1e}"
         head = f"{r['section']:>10}  {r['dtype']:>8}  {r['way']:>24}"
         timing = f"+- {r['spread']:4.0%}  compile {r['compile_seconds']:5.1f} s"
         print(f"{head}  {r['rate']:9.3g} {r['unit']:11}  {timing}{extra}", flush=True)

@@ -1,6 +1,7 @@
 """What the sections of bench_throughput.py share: the ball, throws, C programs, timing by turns, rows of the table."""
 
 import ctypes
+import math
 import os
 import pathlib
 import shutil
@@ -25,6 +26,7 @@ jax.config.update("jax_enable_x64", True)
 
 HERE = pathlib.Path(__file__).parent
 HEIGHT, BOUNCES = 1.0, 64
+SHORTEST = 0.05  # s of one measurement
 BALL = Ball(radius=0.025, mass=0.046)
 DTYPES = {"float32": np.float32, "float64": np.float64}
 
@@ -108,21 +110,25 @@ def distance(columns: np.ndarray, final: BallState) -> np.ndarray:
 
 def by_turns(ways: dict[str, Callable[[], Any]], runs: int) -> dict[str, tuple[float, float, float]]:
     """Seconds of the first call less one run, the median run, and half the spread of the middle half."""
-    first = {}
-    for name, way in ways.items():
-        begin = time.perf_counter()
-        jax.block_until_ready(way())
-        first[name] = time.perf_counter() - begin
+    first = {name: _seconds(way, 1) for name, way in ways.items()}
+    # A short run may fit between two interruptions by others, where a long one does not: so none is short.
+    times_each = {name: max(1, min(math.ceil(SHORTEST / _seconds(way, 1)), 1000)) for name, way in ways.items()}
     times: dict[str, list] = {name: [] for name in ways}
     for _ in range(runs):
         for name, way in ways.items():
-            begin = time.perf_counter()
-            jax.block_until_ready(way())
-            times[name].append(time.perf_counter() - begin)
+            times[name].append(_seconds(way, times_each[name]))
     middle = {name: np.quantile(t, [0.25, 0.5, 0.75]) for name, t in times.items()}
     return {
         name: (max(first[name] - m, 0.0), float(m), float(high - low) / 2) for name, (low, m, high) in middle.items()
     }
+
+
+def _seconds(way: Callable[[], Any], count: int) -> float:
+    """Of one run, out of so many."""
+    begin = time.perf_counter()
+    for _ in range(count):
+        jax.block_until_ready(way())
+    return (time.perf_counter() - begin) / count
 
 
 def row(section: str, dtype: str, way: str, rate: float, unit: str, compiling: float, spread: float) -> dict:
