@@ -1,8 +1,8 @@
 /* A rough elastic ball between a floor and a ceiling: the limit that bench_throughput.py compares with.
 
-   Each vector holds the same number of one ball per lane; a ball's ten numbers stay in registers for all its bounces, and
-   threads share the balls. It knows the scene (horizontal planes, one law, no spin about z) and checks nothing: no corner,
-   no resting ball, no end of time, no input.
+   Each vector holds the same number of one ball per lane; a ball's ten numbers stay in registers for all its bounces,
+   and threads share the balls. It knows the scene (horizontal planes, one law, no spin about z) and checks nothing: no
+   corner, no resting ball, no end of time, no input.
 
    numbers: height, radius, gravity, inertia ratio. On return the state on arrival at impact number `limit` + 1, before
    it, and when that is. */
@@ -14,8 +14,8 @@ void run(const REAL *before, REAL *after, long n, const REAL *numbers, int limit
     const REAL k = 2 * alpha / (1 + alpha), twist = k / (alpha * radius), low = radius, high = height - radius;
 #pragma omp parallel for schedule(static)
     for (long i = 0; i < n; i += LANES) {
-        vec x = AT(before, 0), y = AT(before, 1), z = AT(before, 2), u = AT(before, 3), v = AT(before, 4), w = AT(before, 5);
-        vec a = AT(before, 6), b = AT(before, 7), t = {0};
+        vec x = AT(before, 0), y = AT(before, 1), z = AT(before, 2), u = AT(before, 3), v = AT(before, 4);
+        vec w = AT(before, 5), a = AT(before, 6), b = AT(before, 7), t = {0};
         for (int j = 0;; j++) {
             vec up = z - low, down = high - z, square = w * w - 2 * g * down;
             mask above = (w > 0) & (square > 0); /* it reaches the ceiling first */

@@ -1,7 +1,7 @@
 /* Whole vectors of REAL, one ball a lane: what the C programs beside bench_throughput.py share.
 
-   Each has run(before, after, n, numbers, limit). `before` holds position, velocity and spin, nine columns of n numbers,
-   aligned to 64 bytes, n a multiple of LANES; `after` the same and one column more. */
+   Each has run(before, after, n, numbers, limit). `before` holds position, velocity and spin, nine columns of n
+   numbers, aligned to 64 bytes, n a multiple of LANES; `after` the same and one column more. */
 
 #include <math.h>
 

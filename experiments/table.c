@@ -1,9 +1,9 @@
-/* A rough elastic ball on a floor, under and over a table with edges and corners: what bench_throughput.py compares with.
+/* A rough elastic ball on a floor and a table with edges and corners: what bench_throughput.py compares with.
 
    Each vector holds the same number of one ball per lane, and threads share the vectors. A ball touches the table where
    its centre reaches a box with rounded edges and corners. That lies in a box with sharp ones, and a parabola is in the
-   latter during at most two stretches of time, on its way up and on its way down, in closed form. Most flights have none,
-   or enter through a face where it is both boxes' face: that is the impact. The others look for it by steps that
+   latter during at most two stretches of time, on its way up and on its way down, in closed form. Most flights have
+   none, or enter through a face where it is both boxes' face: that is the impact. The others look for it by steps that
    cannot pass it, from a bound of the second derivative of the squared distance.
 
    It knows the scene (one law, elastic, a box along the axes, gravity along z) and checks nothing: no resting ball, no
@@ -44,7 +44,8 @@ static inline Stretch above(vec z, vec w, REAL g, REAL level, vec *square) {
 }
 
 /* The first zero of the squared distance to the core less r^2 within a stretch, on lanes that `may`. */
-static __attribute__((noinline)) mask search(const Ball *b, const Scene *s, Stretch in, mask may, mask touching, vec *hit) {
+static __attribute__((noinline)) mask
+search(const Ball *b, const Scene *s, Stretch in, mask may, mask touching, vec *hit) {
     const REAL r = s->radius, bend = 2 * r * s->g, near = 4 * EPS * r;
     vec t = in.from;
     mask found = none();
@@ -56,7 +57,7 @@ static __attribute__((noinline)) mask search(const Ball *b, const Scene *s, Stre
             level += beyond * beyond;
             rate += 2 * beyond * pick(x[i] < 0, -speed[i], speed[i]);
         }
-        if (turn == 0) level = pick(touching, all(0), level);
+        if (turn == 0) level = pick(touching & (t <= 0), all(0), level); /* it starts in contact */
         vec edge = root(most(rate * rate + 2 * bend * level, all(0)));
         mask here = may & (level <= near) & (rate < 0), closes = rate < 0;
         found |= here;

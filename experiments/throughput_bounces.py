@@ -44,17 +44,18 @@ def table(n: int, runs: int) -> list[dict]:
     for name, dtype in DTYPES.items():
         states = _under_the_table(n, dtype)
         own = lambda states: simulate_batch(TABLE, states, t1=1.0, max_impacts=16, log_size=0)  # noqa: E731
-        end = own(states)
-        impacts = np.asarray(end.n_impacts)
+        impacts = float(own(states).n_impacts.sum())
         ways = on_devices(own, states)
         if has_c():
             numbers = [BALL.radius, 9.81, BALL.inertia_ratio, *TOP.center, *TOP.half_size, 1.0]
-            ways["C"] = Program("table.c", dtype, 16).of(states, numbers)
-            columns = ways["C"]()
-            error, alike = np.median(distance(columns, end.final)), np.mean(columns[9] == impacts)
-            print(f"{name}: median difference of the final position, C and this library: {error:.1e} m; ", end="")
-            print(f"{alike:.3%} of the throws have the same number of impacts")
-        rows += timed_rows("table", name, ways, float(impacts.sum()), "bounces/s", runs)
+            program = Program("table.c", dtype, 16)
+            ways["C"] = program.of(states, numbers)
+            for which, others in {"these throws": states, "throws at its edges": _at_the_edges(n, dtype)}.items():
+                columns, end = program.of(others, numbers)(), own(others)
+                error, alike = np.median(distance(columns, end.final)), np.mean(columns[9] == end.n_impacts)
+                print(f"{name}, {which}: C and this library end {error:.1e} m apart (median); ", end="")
+                print(f"{alike:.3%} have the same number of impacts")
+        rows += timed_rows("table", name, ways, impacts, "bounces/s", runs)
     return rows
 
 
@@ -64,3 +65,19 @@ def _under_the_table(n: int, dtype: Any) -> BallState:
     spread = (0.05, 0.3, 10.0)
     noisy = [np.asarray(m) + s * rng.standard_normal((n, 3)) for m, s in zip(parts, spread, strict=True)]
     return BallState(*(jnp.asarray(x.astype(dtype)) for x in noisy))
+
+
+def _at_the_edges(n: int, dtype: Any) -> BallState:
+    """Throws from all around at points near the edges and corners of the table: for the check alone."""
+    rng = np.random.default_rng(2)
+    center, half = (np.array([float(c) for c in x]) for x in (TOP.center, TOP.half_size))
+    along = np.arange(3) == rng.integers(0, 4, (n, 1))  # of the edge; none for a corner
+    target = center + half * np.where(along, rng.uniform(-1.0, 1.0, (n, 3)), rng.choice([-1.0, 1.0], (n, 3)))
+    start = target + 0.3 * rng.standard_normal((n, 3))
+    start[:, 2] = np.maximum(start[:, 2], 2.0 * BALL.radius)
+    inside = (np.abs(start - center) < half + 2.0 * BALL.radius).all(axis=1)
+    start[inside, 2] = center[2] + 0.5
+    time = rng.uniform(0.1, 0.5, (n, 1))
+    velocity = (target + 0.01 * rng.standard_normal((n, 3)) - start) / time + [0.0, 0.0, 0.5 * 9.81] * time
+    spin = 50.0 * rng.standard_normal((n, 3))
+    return BallState(*(jnp.asarray(x.astype(dtype)) for x in (start, velocity, spin)))
