@@ -3,8 +3,9 @@
    Tsit5 with Diffrax's tableau, interpolant, error norm, first step and step control. Each vector holds the same number
    of one ball per lane; a turn of the loop tries one step on every lane and, where it is accepted and the ball arrives,
    cuts it by Newton steps on the interpolant and bounces. Threads share the vectors. Neither drag nor lift may hold
-   against gravity (z is concave), so that a floor is hit where a step ends below it, and a ceiling also within one; from
-   the end and the start, Newton's steps then cannot pass the impact. It checks nothing: no resting ball, no input.
+   against gravity (z is concave), so that a floor is hit where a step ends below it, and a ceiling also within one;
+   from the end and the start, Newton's steps then cannot pass the impact. It checks nothing: no resting ball, no
+   input.
 
    numbers: see Numbers. On return the state at t1, or before impact number `limit` + 1, and the numbers of impacts. */
 
