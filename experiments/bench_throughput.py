@@ -7,7 +7,12 @@ gradient in nine inputs, 16 impacts; `scaling`, with batch size, impacts and sur
 The C programs are compiled here (-O3, OpenMP, state in registers). All ways of a section run by turns, medians after
 compilation, each way as often in a turn as takes 50 ms.
 
+On an accelerator the C programs are left out. With what the device can do at most, operations a second (of float32 and,
+if given, of float64) and bytes a second of its memory, rows that bounce between floor and ceiling say what part of it
+they reach, at the operations of bounces.c and one passage of the state through memory for every bounce.
+
     python experiments/bench_throughput.py [--sections limit,table] [--throws 1048576] [--runs 5] [--json FILE]
+        [--peak-flops FLOAT32 [FLOAT64]] [--peak-bytes BYTES]
 """
 
 import argparse
@@ -39,6 +44,17 @@ SECTIONS = {
 }
 
 
+def with_limits(rows: list[dict], flops: list[float], bandwidth: float | None) -> list[dict]:
+    """The rows, with the part of the device's limits that they reach."""
+    peak = dict(zip(("float32", "float64"), flops, strict=False))
+    for r in rows:
+        if "flops_each" in r and r["dtype"] in peak:
+            r["of_flops"] = r["rate"] * r["flops_each"] / peak[r["dtype"]]
+        if "bytes_each" in r and bandwidth:
+            r["of_bytes"] = r["rate"] * r["bytes_each"] / bandwidth
+    return rows
+
+
 def printed(rows: list[dict]) -> None:
     for r in rows:
         extra = f"  {r['of_c']:.3f} of C" if "of_c" in r else ""
@@ -46,6 +62,9 @@ def printed(rows: list[dict]) -> None:
         extra += f"  {r['times_restarted']:.1f} x restarted" if "times_restarted" in r else ""
         if "median_error" in r:
             extra += f"  median error {r['median_error']:.1e} m, tolerance {r['tolerance']:.1e}"
+        extra += f"  {r['of_flops']:.2%} of peak flops" if "of_flops" in r else ""
+        extra += f"  {r['of_bytes']:.2%} of peak bytes" if "of_bytes" in r else ""
+        extra += f"  budget {r['budget_seconds']:.0f} s" if "budget_seconds" in r else ""
         head = f"{r['section']:>10}  {r['dtype']:>8}  {r['way']:>24}"
         timing = f"+- {r['spread']:4.0%}  compile {r['compile_seconds']:5.1f} s"
         print(f"{head}  {r['rate']:9.3g} {r['unit']:11}  {timing}{extra}", flush=True)
@@ -57,6 +76,8 @@ def main() -> None:
     parser.add_argument("--throws", type=int, default=1 << 20)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--json")
+    parser.add_argument("--peak-flops", type=float, nargs="+", default=[], help="of all devices, float32 then float64")
+    parser.add_argument("--peak-bytes", type=float, help="a second, of all devices")
     options = parser.parse_args()
     unknown = set(options.sections.split(",")) - set(SECTIONS)
     if unknown:
@@ -67,7 +88,7 @@ def main() -> None:
     for name in options.sections.split(","):
         section = SECTIONS[name]
         new = section.run(max(options.throws // section.part, 1), options.runs)
-        printed(new)
+        printed(with_limits(new, options.peak_flops, options.peak_bytes))
         rows += new
     if options.json:
         pathlib.Path(options.json).write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1))

@@ -12,6 +12,7 @@ from throughput_shared import (
     Program,
     distance,
     has_c,
+    hop_limits,
     on_devices,
     room,
     throws,
@@ -34,7 +35,8 @@ def limit(n: int, runs: int) -> list[dict]:
             ways["C"] = Program("bounces.c", dtype, BOUNCES).of(states, [HEIGHT, BALL.radius, 9.81, BALL.inertia_ratio])
             error = np.median(distance(ways["C"](), own(states).final))
             print(f"{name}: median difference after {BOUNCES} bounces, C and this library: {error:.1e} m")
-        rows += timed_rows("limit", name, ways, n * BOUNCES, "bounces/s", runs)
+        new = timed_rows("limit", name, ways, n * BOUNCES, "bounces/s", runs)
+        rows += [each | hop_limits(dtype) for each in new]
     return rows
 
 

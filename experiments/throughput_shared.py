@@ -26,6 +26,9 @@ jax.config.update("jax_enable_x64", True)
 
 HERE = pathlib.Path(__file__).parent
 HEIGHT, BOUNCES = 1.0, 64
+# Of one turn of the loop of bounces.c: 14 for the two times of arrival, 7 for the flight, 12 for the impact; a root and
+# a division (two of each) count as one, and comparisons, choices and changes of sign as none.
+FLOPS = 33
 SHORTEST = 0.05  # s of one measurement
 BALL = Ball(radius=0.025, mass=0.046)
 DTYPES = {"float32": np.float32, "float64": np.float64}
@@ -48,6 +51,12 @@ def throws(n: int, dtype: Any) -> BallState:
     position = rng.uniform(-0.3, 0.3, (n, 3)) + [0.0, 0.0, 0.5]
     parts = position, rng.uniform(-6.0, 6.0, (n, 3)), 50.0 * rng.standard_normal((n, 3))
     return BallState(*(jnp.asarray(part.astype(dtype)) for part in parts))
+
+
+def hop_limits(dtype: Any) -> dict:
+    """What one bounce between floor and ceiling takes: FLOPS; and nine numbers read and written, for a program that
+    keeps nothing between bounces (bounces.c does so once for all of them)."""
+    return {"flops_each": FLOPS, "bytes_each": 18 * np.dtype(dtype).itemsize}
 
 
 def on_one_device(states: BallState) -> BallState:
