@@ -65,7 +65,7 @@ def printed(rows: list[dict]) -> None:
         extra += f"  {r['of_flops']:.2%} of peak flops" if "of_flops" in r else ""
         extra += f"  {r['of_bytes']:.2%} of peak bytes" if "of_bytes" in r else ""
         extra += f"  budget {r['budget_seconds']:.0f} s" if "budget_seconds" in r else ""
-        head = f"{r['section']:>10}  {r['dtype']:>8}  {r['way']:>24}"
+        head = f"{r['section']:>10}  {r['dtype']:>8}  {r['way']:>28}"
         timing = f"+- {r['spread']:4.0%}  compile {r['compile_seconds']:5.1f} s"
         print(f"{head}  {r['rate']:9.3g} {r['unit']:11}  {timing}{extra}", flush=True)
 

@@ -13,6 +13,8 @@
 
 #include "lanes.h"
 
+_Static_assert(sizeof(REAL) == 8, "float64 only: the tenth root reads its bits");
+
 typedef int64_t whole __attribute__((vector_size(64)));
 typedef struct { REAL low, high, g, drag, lift, restitution, grip, arm, twist, t1, tolerance; } Numbers;
 typedef struct { vec x[3], v[3], spin[3]; } Ball;
