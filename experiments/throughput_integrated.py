@@ -11,7 +11,7 @@ from throughput_shared import Program, by_turns, has_c, on_devices, on_one_devic
 from nonholo_jax import Air, BallState, Integrated, simulate_batch
 
 TOLERANCES = 1e-6, 1e-8
-RESTARTED = 1024  # throws of the restarted solver: more are no faster, and take minutes
+RESTARTED = 1024  # throws of the restarted solver: of 256, 1024 and 4096 its quickest batch here
 
 
 def integrated(n: int, runs: int) -> list[dict]:
