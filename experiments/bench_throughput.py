@@ -3,7 +3,8 @@
 Sections: `limit`, floor and ceiling, elastic, 64 impacts of each throw, beside bounces.c, on one device and on all;
 `table`, throws under a table, a Box, beside table.c; `integrated`, throws with air, beside `diffrax.diffeqsolve`
 restarted at every bounce and runge_kutta.c, at equal median error; `gradient`, a scalar of the end against that and its
-gradient in nine inputs, 16 impacts; `scaling`, with batch size, impacts and surfaces, with compilation time beside it.
+gradient in nine inputs, 16 impacts; `scaling`, with batch size, impacts and surfaces, with compilation time beside it;
+`peers`, a drop with four elastic bounces beside MuJoCo, MJX and Jaxonomy, where installed, at equal error.
 The C programs are compiled here (-O3, OpenMP, state in registers). All ways of a section run by turns, medians after
 compilation, each way as often in a turn as takes 50 ms.
 
@@ -27,6 +28,7 @@ from report import machine
 from throughput_bounces import limit, table
 from throughput_gradient import gradient
 from throughput_integrated import integrated
+from throughput_peers import peers
 from throughput_scaling import scaling
 
 
@@ -41,6 +43,7 @@ SECTIONS = {
     "integrated": Section(integrated, 64),
     "gradient": Section(gradient, 64),
     "scaling": Section(scaling),
+    "peers": Section(peers, 16),
 }
 
 
@@ -62,6 +65,8 @@ def printed(rows: list[dict]) -> None:
         extra += f"  {r['times_restarted']:.1f} x restarted" if "times_restarted" in r else ""
         if "median_error" in r:
             extra += f"  median error {r['median_error']:.1e} m, tolerance {r['tolerance']:.1e}"
+        extra += f"  error {r['error']:.1e}, at most {r['error_max']:.1e} m, of {r['throws']}" if "error" in r else ""
+        extra += "".join(f"  {r[key]:.3g} x {key[6:]}" for key in ("times_exact", "times_integrated") if key in r)
         extra += f"  {r['of_flops']:.2%} of peak flops" if "of_flops" in r else ""
         extra += f"  {r['of_bytes']:.2%} of peak bytes" if "of_bytes" in r else ""
         extra += f"  budget {r['budget_seconds']:.0f} s" if "budget_seconds" in r else ""
