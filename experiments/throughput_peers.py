@@ -38,7 +38,7 @@ STEPS = {"spring": (1e-3, 1e-4), "RK4": (1e-3, 1e-4), "damper": (1e-3, 3e-4, 1e-
 MJX_STEPS = {np.float64: (1e-3, 3e-4, 1e-4), np.float32: (3e-4,)}  # seconds
 TOLERANCES = (1e-3, 1e-9)
 EVENTS = ((1e-4, 20), (1e-6, 30), (1e-6, 40))  # Jaxonomy: tolerance, bisections; the last is its default
-EVALUATIONS, MJX_THROWS, JAXONOMY_THROWS = 400_000, 128, 4096  # of MuJoCo a run; batches
+EVALUATIONS, MJX_THROWS, JAXONOMY_THROWS = 400_000, 64, 4096  # of MuJoCo a run; batches
 IMPEDANCE = "0.9999 0.9999 0.001"  # the contact gives nearly all of the acceleration it asks for
 
 
@@ -249,14 +249,18 @@ def _as_good(one: dict, other: dict) -> bool:
 
 
 def summary(name: str, rows: list[dict]) -> None:
-    """Print the cheapest way of a peer to reach each error, or the best that it reached."""
+    """Print the cheapest way of a peer to reach each error, and the best that it reached where one was not reached."""
+    smallest: dict[str, float] = {}  # error that each of these ways is the cheapest to reach
     for target in TARGETS:
         reached = [r for r in rows if r["error"] <= target]
-        if not reached:
-            best = min(rows, key=lambda r: r["error"])
-            print(f"{name}: {target:.0e} m not reached on this ladder, the best is {_told(best)}")
-            return
-        print(f"{name}: {target:.0e} m reached by {_told(min(reached, key=lambda r: r['seconds']))}")
+        if reached:
+            smallest[_told(min(reached, key=lambda r: r["seconds"]))] = target
+    for told, target in smallest.items():
+        print(f"{name}: {target:.0e} m reached by {told}")
+    best = min(rows, key=lambda r: r["error"])
+    if best["error"] > TARGETS[-1]:
+        missed = max(target for target in TARGETS if target < best["error"])
+        print(f"{name}: {missed:.0e} m not reached on this ladder, the best is {_told(best)}")
 
 
 def _told(r: dict) -> str:
