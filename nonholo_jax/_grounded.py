@@ -14,6 +14,7 @@ from jax import lax
 
 from . import _rolling as rolling, _train as train
 from ._floors import Floors
+from ._hops import Hopper
 from ._rotation import rolled
 from ._round import round_bend, round_level
 from ._scene import Flight, Scene
@@ -452,7 +453,11 @@ class Grounded(AbstractSystem):
     # Where nothing settles
 
     def hopper(self, state):
-        return None if self.scene.hopper(state.flight) is None else self._hop
+        return None if self.scene.hopper(state.flight) is None else Hopper(self._hop, self._hop_again)
+
+    def _hop_again(self, touching, choice, left, state):
+        duration, flight = self.scene.hop_again(touching, choice, left, state.flight)
+        return duration, Travel(flight, state.support)
 
     def _hop(self, touching, going, full, left, state):
         def dies_out(i, wall, speed, left):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ._crossing import meeting, newton, search
-from ._hops import ENDS, FULL
+from ._hops import ENDS, FULL, PAUSES
 from ._motion import AbstractMotion
 from ._shared import shared
 from ._system import AbstractSystem
@@ -282,6 +282,7 @@ class _Hopping(NamedTuple):
     state: Any
     mark: Any  # the contact just left, or -1; once it has stopped, when and why, as `_stopped` has it
     turn: Any
+    path: Any  # the choices so far, or none
 
 
 def _stopped(turn: Any, touching: Any, why: Any, bits: int) -> Any:
@@ -294,29 +295,31 @@ def _unmarked(mark: Any, bits: int) -> tuple:
     return known >> (bits + 2), ((known >> 2) & ((1 << bits) - 1)) - 1, known & 3
 
 
-def _hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int) -> Carry:
-    """The motion as far as it is a row of ordinary impacts, known in closed form. All lanes that hop are at the same
-    impact, so that the number of turns counts their impacts."""
+def hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows: int = 0) -> tuple[Carry, Any]:
+    """The motion as far as it is a row of ordinary impacts, known in closed form, and the choices of the hops, in so
+    many rows. All lanes that hop are at the same impact, so that the number of turns counts their impacts."""
     bits, hopper = system.n_contacts.bit_length(), system.hopper(carry.state)
     assert hopper is not None
 
     def hop(c: _Hopping) -> _Hopping:
         going, full = c.mark >= -1, c.turn >= max_impacts - carry.n_impacts
-        done = hopper(c.mark, going, full, t1 - c.time + c.ahead, c.state)
-        why = jnp.where(done.choice == ENDS, 0, jnp.where(done.choice == FULL, 1, 2))
+        done = hopper.first(c.mark, going, full, t1 - c.time + c.ahead, c.state)
+        why = jnp.where(done.choice == ENDS, 0, jnp.where(done.choice <= FULL, 1, 2))
         stop = _stopped(c.turn, jnp.maximum(c.mark, -1), why, bits)
         mark = jnp.where(done.choice >= 0, done.choice.astype(jnp.int32), jnp.where(going, stop, c.mark))
         time, ahead = later(c.time, c.ahead, done.duration)
-        return _Hopping(time, ahead, done.state, mark, c.turn + 1)
+        path = c.path.at[c.turn].set(done.choice.astype(c.path.dtype)) if rows else c.path
+        return _Hopping(time, ahead, done.state, mark, c.turn + 1, path)
 
     zero = jnp.asarray(0, dtype=jnp.int32)
     free = ~carry.done & (carry.s == 0) & (system.phase(carry.state) < 0)
     mark = jnp.where(free, carry.touching, _stopped(zero, -1, 2, bits))
-    begin = _Hopping(carry.time, carry.ahead, carry.state, mark, zero)
+    path = jnp.full((rows,), int(PAUSES), jnp.int16)
+    begin = _Hopping(carry.time, carry.ahead, carry.state, mark, zero, path)
     end = lax.while_loop(lambda c: eqxi.unvmap_any(c.mark >= -1), hop, begin)
     n_impacts, touching, why = _unmarked(end.mark, bits)
     reached, full, moved = free & (why == 0), free & (why == 1), n_impacts > 0
-    return carry._replace(
+    carry = carry._replace(
         time=jnp.where(reached, t1, end.time),
         ahead=end.ahead,
         state=end.state,
@@ -330,6 +333,7 @@ def _hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int) -> 
         done=carry.done | reached | full,
         result=RESULTS.where(full, RESULTS.max_impacts, carry.result),
     )
+    return carry, end.path
 
 
 def can_hop(system: AbstractSystem, motion: AbstractMotion, state: Any, max_impacts: int) -> bool:
@@ -345,7 +349,7 @@ def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
     if kind == "hop":  # by turns as far as one can hop, and one turn of what cannot
         one = lambda c: lax.cond(eqxi.unvmap_any(~c.done), next_turn, lambda c: c, c)  # noqa: E731
-        end = lax.while_loop(going, lambda c: one(_hopped(c, system, t1, max_impacts)), carry)
+        end = lax.while_loop(going, lambda c: one(hopped(c, system, t1, max_impacts)[0]), carry)
     elif kind == "lax":
         end = lax.while_loop(going, next_turn, carry)
     else:

@@ -1,7 +1,7 @@
 """The motion of a system, with derivatives in both modes: find, then replay.
 
-Without derivatives the event loop runs as it is. With them it runs without them and records the path (sizes of arcs,
-contacts), a part at a time, and each part is repeated with derivatives in a scan that both modes can handle.
+The event loop runs without derivatives. Where they are asked for it runs again, in tiles, and records the path (sizes
+of arcs, contacts), a part at a time, and each part is repeated with derivatives in a scan that both modes can handle.
 """
 
 from typing import Any, NamedTuple
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ._crossing import corrected
+from ._hops import ENDS, PAUSES
 from ._loop import (
     Carry,
     Log,
@@ -24,6 +25,7 @@ from ._loop import (
     can_hop,
     computed_once,
     find,
+    hopped,
     keep,
     kind_of,
     later,
@@ -34,11 +36,12 @@ from ._loop import (
 from ._motion import AbstractMotion
 from ._shared import shared
 from ._system import AbstractSystem
+from ._tangents import Iteration, tangent_of
 from ._tiles import in_tiles
 from ._types import RESULTS
 from ._vector import frozen
 
-_CHUNK, _CHUNKS_AT_ONCE = 16, 4
+_CHUNK, _ROWS = 4, 32  # arcs: of which none is repeated where all lanes have ended; of one part of a path
 _HOP_TILE = 1024
 
 
@@ -124,46 +127,84 @@ def _resumed(system, motion, t1, carry: Carry, stop: Any, max_impacts: int) -> C
     return carry._replace(done=ended)
 
 
-def replay(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int) -> Outcome:
-    """The motion with derivatives. By turns a part of the path is found without them and repeated with them, so that
-    only one part at a time is in memory."""
-    still, now = frozen((system, motion)), frozen((state, t0, t1))
-    chunks = -(-motion.max_pieces(max_impacts) // _CHUNK)
-    size = -(-motion.max_pieces(max_impacts) // chunks)  # equal chunks, none of which is mostly padding
-    per_part = min(chunks, _CHUNKS_AT_ONCE)
-    rows = size * per_part
-    begin = start(still[0], still[1], now[0], now[1], now[2], log_rows, rows)
-    moves = ~begin.done  # a lane that cannot start computes harmless numbers, and gives back what was found
-    harmless = lambda x: jnp.where(moves, x, jnp.ones_like(x)) if eqx.is_inexact_array(x) else x  # noqa: E731
-    system, state = jax.tree.map(harmless, (system, as_arrays(state, t0.dtype)))  # NaN times zero is NaN in derivatives
-    t0, t1 = (jnp.where(moves, t, 0.0) for t in (t0, t1))
-    _, memory = motion.begin(system, t0, state, t1)
-    end = frozen(t1)
-    values = jnp.where(jnp.isnan(begin.log.values), 0.0, begin.log.values)
+def _hop_again(r: _Replay, choices: Any, system, t1: Any) -> _Replay:
+    """The hops of a path."""
+    hopper = system.hopper(r.state)
 
-    def part(both, first):
-        def run(both):
-            search, r = both
-            empty = Path(jnp.zeros_like(search.path.sizes), jnp.full_like(search.path.labels, -1))
-            resume = lambda system, motion, t1, c, stop: _resumed(system, motion, t1, c, stop, max_impacts)  # noqa: E731
-            search = in_tiles(resume, motion.tile)(*still, end, search._replace(path=empty), first + rows)
-            search = frozen(search)
-            index = first + jnp.arange(rows, dtype=jnp.int32)
-            steps = jax.tree.map(lambda x: x.reshape(per_part, size, *x.shape[1:]), (index, *search.path))
-            steps = (steps[0], *[(pair[..., 0], pair[..., 1]) for pair in steps[1:]])
-            return search, _repeat(r, steps, system, motion, t1, search)
+    def one(carry, choice):
+        time, ahead, state, before = carry
+        choice = choice.astype(t1.dtype)
+        duration, state = hopper.again(before, choice, t1 - time + ahead, state)
+        time, ahead = later(time, ahead, duration)
+        return (jnp.where(choice == ENDS, t1, time), ahead, state, choice), None
 
-        return lax.cond(eqxi.unvmap_any(~both[0].done), run, lambda both: both, both), None
+    def some(carry, choices):
+        return lax.scan(jax.checkpoint(one, prevent_cse=False), carry, choices)[0]
 
-    zero = jnp.asarray(0, dtype=jnp.int32)
-    nothing = jnp.zeros_like(t0)
-    r = _Replay(t0, nothing, state, memory, jnp.asarray(True), nothing, zero, values)
-    firsts = rows * jnp.arange(-(-chunks // per_part), dtype=jnp.int32)
-    body = part if firsts.size == 1 else jax.checkpoint(part, prevent_cse=False)
-    (search, r), _ = lax.scan(body, (begin, r), firsts)
-    time, state = keep(moves, (r.time, r.state), (search.time, search.state))
-    log = Log(jnp.where(jnp.isnan(search.log.values), search.log.values, r.values), search.log.labels)
-    return Outcome(time, state, search.n_impacts, search.n_arcs, search.result, log)
+    def some_if_any(carry, choices):
+        return lax.cond(eqxi.unvmap_any(choices[0] != int(PAUSES)), some, lambda carry, _: carry, carry, choices), None
+
+    chunks = -(-choices.size // _ROWS)
+    size = -(-choices.size // chunks)
+    choices = jnp.pad(choices, (0, size * chunks - choices.size), constant_values=int(PAUSES)).reshape(chunks, size)
+    begin = (r.time, r.ahead, as_arrays(r.state, t1.dtype), jnp.full_like(t1, -1.0))
+    if chunks == 1:
+        time, ahead, state, _ = some(begin, choices[0])
+    else:
+        (time, ahead, state, _), _ = lax.scan(jax.checkpoint(some_if_any, prevent_cse=False), begin, choices)
+    return r._replace(time=time, ahead=ahead, state=state)
+
+
+def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion) -> Iteration:
+    """The motion with derivatives: by turns a part of the path is found without them and repeated with them. Between
+    the steps there is what was found, and what was repeated."""
+    rows = min(_ROWS, _CHUNK * -(-motion.max_pieces(max_impacts) // _CHUNK))
+    most = -(-motion.max_pieces(max_impacts) // rows)
+
+    def harmless(arguments: Any, moves: Any) -> Any:
+        """A lane that cannot start computes harmless numbers: NaN times zero is NaN in derivatives."""
+        system, motion, state, t0, t1 = arguments
+        tame = lambda x: jnp.where(moves, x, jnp.ones_like(x)) if eqx.is_inexact_array(x) else x  # noqa: E731
+        system, state = jax.tree.map(tame, (system, as_arrays(state, t0.dtype)))
+        return system, motion, state, *(jnp.where(moves, t, 0.0) for t in (t0, t1))
+
+    def begin(arguments: Any) -> tuple:
+        still = frozen(arguments)
+        found = start(still[0], still[1], still[2], still[3], still[4], log_rows, 0)
+        moves = ~found.done
+        system, motion, state, t0, t1 = harmless(arguments, moves)
+        values = jnp.where(jnp.isnan(found.log.values), 0.0, found.log.values)
+        nothing, zero = jnp.zeros_like(t0), jnp.asarray(0, dtype=jnp.int32)
+        _, memory = motion.begin(system, t0, state, t1)
+        again = _Replay(t0, nothing, state, memory, jnp.asarray(True), nothing, zero, values)
+        if log_rows == 0 and can_hop(system, motion, state, max_impacts):
+            found, path = frozen(hopped(found, still[0], still[4], max_impacts, max_impacts + 1))
+            again = _hop_again(again, path, system, t1)._replace(n_impacts=found.n_impacts)
+        done, found = found.n_arcs, found._replace(n_arcs=jnp.zeros_like(found.n_arcs))
+        moving, rest = eqx.partition(again, eqx.is_inexact_array)
+        return (moves, done, found, rest), moving
+
+    def count(stays: Any, n_arcs: Any) -> Any:
+        _, done, found, _ = stays
+        # Rounding may find another arc or two than were found without derivatives.
+        left = jnp.where(found.done, 0, jnp.maximum(n_arcs - done, 0) + 2)
+        return jnp.minimum(-(-eqxi.unvmap_max(left) // rows), most)
+
+    def step(arguments: Any, i: Any, stays: Any, moving: Any) -> tuple:
+        moves, done, found, rest = stays
+        first, (still, way, _, _, end) = rows * i, frozen(arguments)
+        system, motion, _, _, t1 = harmless(arguments, moves)
+        empty = Path(jnp.zeros((rows, 2), end.dtype), jnp.full((rows, 2), -1, jnp.int32))
+        search = frozen(_resumed(still, way, end, found._replace(path=empty), first + rows, max_impacts))
+        index = first + jnp.arange(rows, dtype=jnp.int32)
+        steps = jax.tree.map(lambda x: x.reshape(-1, _CHUNK, *x.shape[1:]), (index, *search.path))
+        steps = (steps[0], *[(pair[..., 0], pair[..., 1]) for pair in steps[1:]])
+        again = _repeat(eqx.combine(moving, rest), steps, system, motion, t1, search)
+        moving, rest = eqx.partition(again, eqx.is_inexact_array)
+        return (moves, done, search._replace(path=found.path), rest), moving
+
+    asked = lambda moving: (moving.time, moving.state, moving.values)  # noqa: E731
+    return Iteration(begin, count, step, lambda stays: stays[2].done, asked, most)
 
 
 def _find(system, motion, state, t0, t1, **options):
@@ -194,8 +235,13 @@ def _find_or_replay(system, motion, state, t0, t1, *, max_impacts: int, log_rows
 
 @_find_or_replay.def_jvp
 def _find_or_replay_jvp(primals, tangents, *, max_impacts: int, log_rows: int):
-    options = {"max_impacts": max_impacts, "log_rows": log_rows}
-    return eqx.filter_jvp(lambda *primals: replay(*primals, **options), primals, tangents)
+    out = _find_or_replay(*primals, max_impacts=max_impacts, log_rows=log_rows)
+    iteration, still = _iteration(max_impacts, log_rows, primals[1]), frozen(out)
+    like = (still.time, still.state, still.log.values)
+    time, state, values = tangent_of(iteration, primals, tangents, still.n_arcs, like, primals[1].tile)
+    values = jnp.where(jnp.isnan(still.log.values), 0.0, values)
+    nothing = jax.tree.map(lambda _: None, out)
+    return out, nothing._replace(time=time, state=state, log=Log(values, None))
 
 
 def run(

@@ -13,7 +13,7 @@ from jax import lax
 from ._air import Air
 from ._ball import Ball, BallState, check_ball_state
 from ._corner import collide_with_all, is_one_mu
-from ._hops import Wall, hop
+from ._hops import Hopper, Wall, hop, hop_again
 from ._polynomial import Window
 from ._rotation import turned
 from ._shared import shared
@@ -195,11 +195,26 @@ class Scene(AbstractSystem):
 
     def hopper(self, state):
         flat = len(self.surfaces) > 0 and all(type(surface) is Plane for surface in self.surfaces)
-        return self.hop if flat and self.air is None and state.orientation is None else None
+        return Hopper(self.hop, self.hop_again) if flat and self.air is None and state.orientation is None else None
 
     def hop(self, touching, going, full, left, state, dies_out=lambda *_: False):
         """A parabola from plane to plane; `dies_out(i, wall, speed, left)` says whether bounces may end after an
         impact."""
+        walls, g, kicked = self._hopping(left, state)
+        parts = (state.position, state.velocity, state.spin)
+        done = hop(walls, g, kicked, dies_out, touching, going, full, left, parts)
+        position, velocity, spin = done.state
+        return done._replace(state=Flight(position, velocity, spin, None))
+
+    def hop_again(self, touching, choice, left, state):
+        """The same with derivatives, after the choice has been made."""
+        walls, g, kicked = self._hopping(left, state)
+        parts = (state.position, state.velocity, state.spin)
+        duration, (position, velocity, spin) = hop_again(walls, g, kicked, touching, choice, left, parts)
+        return duration, Flight(position, velocity, spin, None)
+
+    def _hopping(self, left, state):
+        """Planes, gravity and impacts, as hops see them."""
         g, x = components(self.gravity), state.position
         walls, origin, zero = [], (0.0, 0.0, 0.0), jnp.zeros_like(left)
         for i, surface in enumerate(self.surfaces):
@@ -212,10 +227,7 @@ class Scene(AbstractSystem):
             # Only the slip is shared: each number more is one more pass over the batch.
             return self._after(choice, n, velocity, spin, lambda x: (x[0], *shared(x[1:])) if len(x) > 2 else x)
 
-        parts = (touching, going, full, left, (x, state.velocity, state.spin))
-        done = hop(walls, g, kicked, dies_out, *parts)
-        position, velocity, spin = done.state
-        return done._replace(state=Flight(position, velocity, spin, None))
+        return walls, g, kicked
 
     def level(self, contact, time, q, state):
         return self.surfaces[contact].level(q, time, self.ball.radius)

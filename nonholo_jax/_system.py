@@ -1,13 +1,14 @@
 """What the event loop asks of a mechanical system."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from ._hops import Hopper
 from ._polynomial import Interval, Window
 from ._types import KINDS, RESULTS, Index, Number, Scalar
 from ._vector import is_constant, plus, times, total
@@ -120,11 +121,9 @@ class AbstractSystem(eqx.Module):
         """The point of contact and the gradient of the gap there."""
 
     @abstractmethod
-    def hopper(self, state: Any) -> Callable | None:
-        """Where the next impact is known in closed form, until something unusual happens: a function
-        `hop(touching, going, full, left, state)` that makes one arc and the impact that ends it, or, where not `going`,
-        nothing: a `Hop`. `touching` is the contact that was left last, `full` says that there may be no further impact,
-        `left` how many seconds are left. Elsewhere `None`."""
+    def hopper(self, state: Any) -> Hopper | None:
+        """Where the next impact is known in closed form, until something unusual happens: how to make one arc and the
+        impact that ends it. Elsewhere `None`."""
 
     @abstractmethod
     def without_contacts(self) -> "AbstractSystem":

@@ -31,10 +31,7 @@ def in_tiles(function: Callable, size: int) -> Callable:
             (batched,) = in_batched
             lanes, rest = eqx.partition(arrays, batched)
             whole = jax.vmap(lambda lanes: function(*eqx.combine(lanes, rest, constants)))
-            if axis_size <= size or jax.default_backend() != "cpu":
-                out = whole(lanes)
-            else:
-                out = _in_turn(whole, lanes, axis_size, size)
+            out = by_tiles(whole, lanes, axis_size, size)
             return out, jax.tree.map(lambda _: True, out)
 
         return run(arrays)
@@ -42,8 +39,11 @@ def in_tiles(function: Callable, size: int) -> Callable:
     return call
 
 
-def _in_turn(whole: Callable, lanes: Any, n: int, size: int) -> Any:
-    """`whole` on tiles of `size` lanes, one after the other; the last tile is filled up with the last lane."""
+def by_tiles(whole: Callable, lanes: Any, n: int, size: int) -> Any:
+    """`whole` on `n` lanes; on a CPU on tiles of `size` lanes, one after the other, the last filled up with the last
+    lane."""
+    if n <= size or jax.default_backend() != "cpu":
+        return whole(lanes)
     n_tiles, padding = -(-n // size), -n % size
     tiles = jax.tree.map(
         lambda x: _filled(x, padding).reshape(n_tiles, size, *x.shape[1:]),

@@ -16,7 +16,9 @@ ORDER = [
     "_shared",
     "_polynomial",
     "_rotation",
+    "_hops",
     "_tiles",
+    "_tangents",
     # ground: the mathematics of impact
     "_impact",
     "_law",
@@ -31,7 +33,6 @@ ORDER = [
     "_round",
     "_air",
     "_corner",
-    "_hops",
     "_scene",
     "_train",
     "_rolling",
