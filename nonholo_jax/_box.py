@@ -84,9 +84,13 @@ def _box_direction(y: Vector3, half: Vector3, axes: tuple) -> Vector3:
     return add(add(scale(n[0], axes[0]), scale(n[1], axes[1])), scale(n[2], axes[2]))
 
 
+def along(x: Vector3, axes: tuple) -> Vector3:
+    """The components of a vector."""
+    return tuple(dot(axis, x) for axis in axes)  # pyright: ignore
+
+
 def _in_frame(x: Vector3, center: Vector3, axes: tuple) -> Vector3:
-    d = subtract(x, center)
-    return tuple(dot(axis, d) for axis in axes)  # pyright: ignore
+    return along(subtract(x, center), axes)
 
 
 def _rotation_axes(rotation: Any) -> tuple:
@@ -101,7 +105,7 @@ def _rotation_axes(rotation: Any) -> tuple:
     return tuple(tuple(turn[i, j] for i in range(3)) for j in range(3))
 
 
-class _AbstractBlock(AbstractSurface):
+class AbstractBlock(AbstractSurface):
     """What a solid box and a thin plate share: half sizes along axes of their own."""
 
     center: eqx.AbstractVar[Any]
@@ -110,6 +114,11 @@ class _AbstractBlock(AbstractSurface):
     @abstractmethod
     def _frame(self) -> tuple[Any, Any, tuple]:
         """The centre, three half sizes, and the axes in the world frame."""
+
+    def in_frame(self, x: Vector3) -> tuple[Vector3, tuple, Vector3]:
+        """A point in the block's own frame, the axes of that in the world, and the half sizes."""
+        center, half, axes = self._frame()
+        return _in_frame(x, center, axes), axes, half
 
     def direction(self, x, t):
         center, half, axes = self._frame()
@@ -145,7 +154,7 @@ def _face(x: Vector3, center: Vector3, half: Vector3, axes: tuple, choices: Sequ
     return Face(normal, center, tangents, sizes, below > 0.5)  # pyright: ignore
 
 
-class Box(_AbstractBlock):
+class Box(AbstractBlock):
     """A solid box with faces, edges and corners: a table top, a step, a brick.
 
     **Arguments:** `center` in m, shape (3,); `half_size` in m, shape (3,), positive; `law` of contact; `rotation`, a
@@ -181,7 +190,7 @@ class Box(_AbstractBlock):
         return [positive("half_size", h) for h in components(self.half_size)]
 
 
-class Rectangle(_AbstractBlock):
+class Rectangle(AbstractBlock):
     """A thin plate with edges; the ball bounces on both of its sides.
 
     **Arguments:** `center` in m, shape (3,); `normal`, shape (3,); `tangent`, shape (3,), the direction of the first

@@ -453,7 +453,8 @@ class Grounded(AbstractSystem):
     # Where nothing settles
 
     def hopper(self, state):
-        return None if self.scene.hopper(state.flight) is None else Hopper(self._hop, self._hop_again)
+        hopper = self.scene.hopper(state.flight)
+        return None if hopper is None or hopper.again is None else Hopper(self._hop, self._hop_again)
 
     def _hop_again(self, touching, choice, left, state):
         duration, flight = self.scene.hop_again(touching, choice, left, state.flight)

@@ -14,14 +14,16 @@ import jax.numpy as jnp
 from jax import lax
 
 from ._crossing import meeting, newton, search
-from ._hops import ENDS, FULL, PAUSES
+from ._hops import ENDS, FULL, PAUSES, Hopper
 from ._motion import AbstractMotion
 from ._shared import shared
 from ._system import AbstractSystem
+from ._tiles import where_needed
 from ._types import KINDS, RESULTS
 from ._vector import frozen, norm
 
 _MOST_IMPACTS_AT_ONCE = 32
+_STRAGGLERS = 16  # lanes that make a turn together
 
 
 class Row(NamedTuple):
@@ -336,9 +338,14 @@ def hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows
     return carry, end.path
 
 
-def can_hop(system: AbstractSystem, motion: AbstractMotion, state: Any, max_impacts: int) -> bool:
+def hopper_of(system: AbstractSystem, motion: AbstractMotion, state: Any, max_impacts: int) -> Hopper | None:
+    """How the system hops, if it does."""
     few = (max_impacts + 2) << (system.n_contacts.bit_length() + 2) < 2**31
-    return motion.is_closed_form and few and system.hopper(state) is not None
+    return system.hopper(state) if motion.is_closed_form and few else None
+
+
+def _turned(c: Carry, system, motion, t1, max_impacts: int) -> Carry:
+    return hopped(turn(c, system, motion, t1, max_impacts), system, t1, max_impacts)[0]
 
 
 def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = "lax") -> Outcome:
@@ -347,9 +354,16 @@ def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind
     carry = start(system, motion, state, t0, t1, log_rows, 0)
     next_turn = lambda c: turn(c, system, motion, t1, max_impacts)  # noqa: E731
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
-    if kind == "hop":  # by turns as far as one can hop, and one turn of what cannot
-        one = lambda c: lax.cond(eqxi.unvmap_any(~c.done), next_turn, lambda c: c, c)  # noqa: E731
-        end = lax.while_loop(going, lambda c: one(hopped(c, system, t1, max_impacts)[0]), carry)
+    if kind == "hop":  # what does not get to its end by hops goes on by turns, and, where hops are short, by both
+        hopper = system.hopper(carry.state)
+        next_of = _turned if hopper is not None and hopper.again is not None else turn
+
+        def rest(c: Carry, given: tuple) -> Carry:
+            system, motion, t1 = given
+            return lax.while_loop(going, lambda c: next_of(c, system, motion, t1, max_impacts), c)
+
+        begun, _ = hopped(carry, system, t1, max_impacts)
+        end = where_needed(rest, _STRAGGLERS)(~begun.done, begun, (system, motion, t1))
     elif kind == "lax":
         end = lax.while_loop(going, next_turn, carry)
     else:

@@ -4,6 +4,7 @@ The event loop runs without derivatives. Where they are asked for it runs again,
 of arcs, contacts), a part at a time, and each part is repeated with derivatives in a scan that both modes can handle.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -22,10 +23,10 @@ from ._loop import (
     Path,
     Row,
     as_arrays,
-    can_hop,
     computed_once,
     find,
     hopped,
+    hopper_of,
     keep,
     kind_of,
     later,
@@ -127,14 +128,13 @@ def _resumed(system, motion, t1, carry: Carry, stop: Any, max_impacts: int) -> C
     return carry._replace(done=ended)
 
 
-def _hop_again(r: _Replay, choices: Any, system, t1: Any) -> _Replay:
+def _hop_again(r: _Replay, choices: Any, hop: Callable, t1: Any) -> _Replay:
     """The hops of a path."""
-    hopper = system.hopper(r.state)
 
     def one(carry, choice):
         time, ahead, state, before = carry
         choice = choice.astype(t1.dtype)
-        duration, state = hopper.again(before, choice, t1 - time + ahead, state)
+        duration, state = hop(before, choice, t1 - time + ahead, state)
         time, ahead = later(time, ahead, duration)
         return (jnp.where(choice == ENDS, t1, time), ahead, state, choice), None
 
@@ -177,9 +177,10 @@ def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion) -> Itera
         nothing, zero = jnp.zeros_like(t0), jnp.asarray(0, dtype=jnp.int32)
         _, memory = motion.begin(system, t0, state, t1)
         again = _Replay(t0, nothing, state, memory, jnp.asarray(True), nothing, zero, values)
-        if log_rows == 0 and can_hop(system, motion, state, max_impacts):
+        hopper = hopper_of(system, motion, state, max_impacts)
+        if log_rows == 0 and hopper is not None and hopper.again is not None:
             found, path = frozen(hopped(found, still[0], still[4], max_impacts, max_impacts + 1))
-            again = _hop_again(again, path, system, t1)._replace(n_impacts=found.n_impacts)
+            again = _hop_again(again, path, hopper.again, t1)._replace(n_impacts=found.n_impacts)
         done, found = found.n_arcs, found._replace(n_arcs=jnp.zeros_like(found.n_arcs))
         moving, rest = eqx.partition(again, eqx.is_inexact_array)
         return (moves, done, found, rest), moving
@@ -210,21 +211,25 @@ def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion) -> Itera
 def _find(system, motion, state, t0, t1, **options):
     """`find`, not differentiated, and in tiles where it is batched."""
     primals = frozen((system, motion, state, t0, t1))
-    if options["log_rows"] == 0 and can_hop(system, motion, state, options["max_impacts"]):
-        return _find_by_hops(*primals, **options)
+    hopper = hopper_of(system, motion, state, options["max_impacts"])
+    if options["log_rows"] == 0 and hopper is not None:
+        return _find_by_hops(*primals, alone="lax" if hopper.again is None else "hop", **options)
     return in_tiles(lambda *primals: find(*primals, **options), motion.tile)(*primals)
 
 
-def _find_by_hops(system, motion, state, t0, t1, **options):
+def _find_by_hops(system, motion, state, t0, t1, *, alone: str, **options):
     """The same. Hops are so quick that reading and writing counts: what passes into a tile and out of it is the user's
     form of a state, few arrays instead of many."""
 
-    def part(system, motion, user, phase, t0, t1):
-        outcome = find(system, motion, system.unpacked(user, phase), t0, t1, kind="hop", **options)
-        return outcome._replace(state=(system.packed(outcome.state), system.phase(outcome.state)))
+    def part(kind):
+        def run(system, motion, user, phase, t0, t1):
+            outcome = find(system, motion, system.unpacked(user, phase), t0, t1, kind=kind, **options)
+            return outcome._replace(state=(system.packed(outcome.state), system.phase(outcome.state)))
+
+        return run
 
     given = (system, motion, system.packed(as_arrays(state, t0.dtype)), system.phase(state), t0, t1)
-    outcome = in_tiles(part, _HOP_TILE)(*given)
+    outcome = in_tiles(part("hop"), _HOP_TILE, part(alone))(*given)
     return outcome._replace(state=system.unpacked(*outcome.state))
 
 

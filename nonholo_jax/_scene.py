@@ -12,8 +12,9 @@ from jax import lax
 
 from ._air import Air
 from ._ball import Ball, BallState, check_ball_state
+from ._box import AbstractBlock, along
 from ._corner import collide_with_all, is_one_mu
-from ._hops import Hopper, Wall, hop, hop_again
+from ._hops import Block, Hopper, Wall, hop, hop_again
 from ._polynomial import Window
 from ._rotation import turned
 from ._shared import shared
@@ -194,8 +195,12 @@ class Scene(AbstractSystem):
         return subtract(velocity, kick), add(spin, scale(twist, cross(n, tuple(slip))))
 
     def hopper(self, state):
-        flat = len(self.surfaces) > 0 and all(type(surface) is Plane for surface in self.surfaces)
-        return Hopper(self.hop, self.hop_again) if flat and self.air is None and state.orientation is None else None
+        if len(self.surfaces) == 0 or self.air is not None or state.orientation is not None:
+            return None
+        if all(type(each) is Plane for each in self.surfaces):
+            return Hopper(self.hop, self.hop_again)
+        known = all(isinstance(each, (Plane, AbstractBlock)) for each in self.surfaces)
+        return Hopper(self.hop, None) if known else None
 
     def hop(self, touching, going, full, left, state, dies_out=lambda *_: False):
         """A parabola from plane to plane; `dies_out(i, wall, speed, left)` says whether bounces may end after an
@@ -217,13 +222,19 @@ class Scene(AbstractSystem):
         """Planes, gravity and impacts, as hops see them."""
         g, x = components(self.gravity), state.position
         walls, origin, zero = [], (0.0, 0.0, 0.0), jnp.zeros_like(left)
+        half_g, v = scale(0.5, g), state.velocity
         for i, surface in enumerate(self.surfaces):
-            n = surface.direction(x, 0.0)
-            gap, there = (self.level(i, zero, place, state) for place in (x, origin))
-            walls.append(Wall(n, gap, dot(n, state.velocity), times(0.5, dot(n, g)), rounding(self, i, x), there))
+            noise = rounding(self, i, x)
+            if isinstance(surface, AbstractBlock):
+                place, axes, half = surface.in_frame(x)
+                walls.append(Block(place, along(v, axes), along(half_g, axes), half, self.ball.radius, noise))
+            else:
+                n = surface.direction(x, 0.0)
+                gap, there = (self.level(i, zero, place, state) for place in (x, origin))
+                walls.append(Wall(n, gap, dot(n, v), dot(n, half_g), noise, there))
 
-        def kicked(choice, velocity, spin):
-            n = select_vector(choice, [wall.normal for wall in walls])
+        def kicked(choice, position, velocity, spin):
+            n = select_vector(choice, [surface.direction(position, 0.0) for surface in self.surfaces])
             # Only the slip is shared: each number more is one more pass over the batch.
             return self._after(choice, n, velocity, spin, lambda x: (x[0], *shared(x[1:])) if len(x) > 2 else x)
 

@@ -15,16 +15,16 @@ from jax.custom_batching import custom_vmap
 from jax.sharding import Mesh, PartitionSpec
 
 
-def in_tiles(function: Callable, size: int) -> Callable:
-    """The same function of pytrees, which under `vmap` on a CPU runs `size` lanes at a time. Not differentiable in
-    reverse mode."""
+def in_tiles(function: Callable, size: int, alone: Callable | None = None) -> Callable:
+    """The same function of pytrees, which under `vmap` on a CPU runs `size` lanes at a time; `alone` is another way to
+    compute it, for one lane. Not differentiable in reverse mode."""
 
     def call(*args):
         arrays, constants = eqx.partition(args, eqx.is_array)
 
         @custom_vmap
         def run(arrays):
-            return function(*eqx.combine(arrays, constants))
+            return (alone or function)(*eqx.combine(arrays, constants))
 
         @run.def_vmap
         def over_lanes(axis_size, in_batched, arrays):
@@ -37,6 +37,55 @@ def in_tiles(function: Callable, size: int) -> Callable:
         return run(arrays)
 
     return call
+
+
+def where_needed(function: Callable, size: int) -> Callable:
+    """`call(needed, lanes, rest)`: `function(lanes, rest)`, which is of the form of `lanes`, where it is needed, and
+    `lanes` elsewhere. Under `vmap` on a CPU the lanes that need it are gathered, `size` at a time, so that few of them
+    cost little. Not differentiable in reverse mode."""
+
+    def call(needed: Any, lanes: Any, rest: Any) -> Any:
+        arrays, constants = eqx.partition(rest, eqx.is_array)
+
+        @custom_vmap
+        def run(needed, lanes, arrays):
+            return lax.cond(needed, lambda lanes: function(lanes, eqx.combine(arrays, constants)), lambda x: x, lanes)
+
+        @run.def_vmap
+        def over_lanes(n, in_batched, needed, lanes, arrays):
+            every = lambda x, batched: x if batched else jnp.broadcast_to(x, (n, *jnp.shape(x)))  # noqa: E731
+            needed, lanes = jax.tree.map(every, (needed, lanes), tuple(in_batched[:2]))
+            many, same = eqx.partition(arrays, in_batched[2])
+            whole = jax.vmap(lambda lanes, many: function(lanes, eqx.combine(many, same, constants)))
+            if n <= size or jax.default_backend() != "cpu":
+                found = whole(lanes, many)
+                out = jax.tree.map(lambda a, b: jnp.where(_like(needed, a), a, b), found, lanes)
+            else:
+                out = _gathered(whole, needed, lanes, many, n, size)
+            return out, jax.tree.map(lambda _: True, out)
+
+        return run(needed, lanes, arrays)
+
+    return call
+
+
+def _like(flags: Any, x: Any) -> Any:
+    return flags.reshape(flags.shape + (1,) * (x.ndim - flags.ndim))
+
+
+def _gathered(whole: Callable, needed: Any, lanes: Any, many: Any, n: int, size: int) -> Any:
+    """Those of the lanes that need it, `size` at a time; a gap in the last group is filled with some lane."""
+    (order,) = jnp.nonzero(needed, size=n + size, fill_value=n)
+    order = order.astype(jnp.int32)
+
+    def group(k: Any, lanes: Any) -> Any:
+        index = lax.dynamic_slice(order, (k * size,), (size,))
+        some = lambda tree: jax.tree.map(lambda x: x.at[index].get(mode="clip"), tree)  # noqa: E731
+        found = whole(some(lanes), some(many))
+        return jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), lanes, found)
+
+    count = jnp.sum(needed, dtype=jnp.int32)
+    return lax.fori_loop(0, -(-count // size), group, lanes)
 
 
 def by_tiles(whole: Callable, lanes: Any, n: int, size: int) -> Any:

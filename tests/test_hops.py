@@ -10,16 +10,18 @@ from nonholo_jax import (
     RESULTS,
     Ball,
     BallState,
+    Box,
     Exact,
     Frictional,
     Plane,
+    Rectangle,
     Rough,
     Scene,
     Smooth,
     simulate,
     simulate_batch,
 )
-from nonholo_jax._loop import _stopped, _unmarked
+from nonholo_jax._loop import _stopped, _unmarked, hopped, start
 
 BALL = Ball(0.1, 0.5)
 SLOPE = (0.6, 0.0, 0.8)
@@ -90,6 +92,82 @@ def test_single_precision(getkey):
     agree(hops, loop, 1e-3, share=0.99)
 
 
+BLOCKS = {
+    "table": lambda number, law: {"table": Box(number((0.6, 0.0, 0.8)), number((0.6, 0.4, 0.05)), law)},
+    "turned": lambda number, law: {"brick": Box((0.0, 0.0, 1.0), (0.3, 0.5, 0.2), law, (0.9, 0.2, -0.3, 0.1))},
+    "shelf": lambda number, law: {
+        "shelf": Rectangle((0.0, 0.0, 0.9), (0.1, 0.0, 1.0), (1.0, 0.0, 0.0), (0.5, 0.3), law)
+    },
+    "two": lambda number, law: {
+        "step": Box((1.2, 0.0, 0.2), (0.5, 2.0, 0.2), law),
+        "brick": Box((0.0, 0.0, 1.0), (0.3, 0.3, 0.3), law),
+    },
+}
+
+
+def throws_at(key, n, block, dtype=float):
+    """At points near faces, edges and corners of a block, from all around it."""
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    place, axes, half = (np.asarray(x) for x in block.in_frame((0.0, 0.0, 0.0)))
+    center, within = -axes.T @ place, rng.uniform(-1.0, 1.0, (n, 3))
+    ends = np.sign(within) * (1.0 + rng.uniform(-0.1, 0.3, (n, 3)))
+    target = center + (np.where(rng.uniform(size=(n, 3)) < 0.5, ends, within) * half) @ axes
+    away = rng.standard_normal((n, 3))
+    away = away / np.linalg.norm(away, axis=1, keepdims=True)
+    start = center + away * (1.1 * np.linalg.norm(half) + 3.0 * BALL.radius)
+    start[:, 2] = np.maximum(start[:, 2], 2.0 * BALL.radius)
+    velocity = (target - start) / 0.3 + [0.0, 0.0, 0.5 * 9.81 * 0.3]
+    return BallState(*(jnp.asarray(x.astype(dtype)) for x in (start, velocity, 20.0 * rng.standard_normal((n, 3)))))
+
+
+def block_scene(blocks, law="elastic", traced=False, gravity=(0.0, 0.0, -9.81)):
+    number = (lambda x: jnp.asarray(x, dtype=float)) if traced else (lambda x: x)
+    floor = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), LAWS[law])
+    return Scene(BALL, {"floor": floor, **BLOCKS[blocks](number, LAWS[law])}, number(gravity))
+
+
+@pytest.mark.parametrize("blocks", BLOCKS)
+def test_blocks(getkey, blocks):
+    """Faces, edges and corners, near misses and what is between them, as often as not met by the search."""
+    room = block_scene(blocks)
+    states = jax.tree.map(
+        lambda *x: jnp.concatenate(x), *[throws_at(getkey(), 400, block) for block in room.surfaces[1:]]
+    )
+    hops, loop = both(room, states, t1=1.0, max_impacts=10)
+    assert (np.asarray(loop.impacts.surface) > 0).any(axis=1).mean() > 0.3
+    agree(hops, loop, 1e-9, share=0.99)
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (2.0, -3.0, 5.0)])
+def test_blocks_of_traced_numbers_in_any_gravity(getkey, gravity):
+    room = block_scene("table", traced=True, gravity=gravity)
+    states = throws_at(getkey(), 300, room.surfaces[1])
+    agree(*both(room, states, t1=1.0, max_impacts=10), 1e-9, share=0.99)
+
+
+def test_blocks_in_single_precision(getkey):
+    room = block_scene("table")
+    states = throws_at(getkey(), 300, room.surfaces[1], np.float32)
+    hops, loop = both(room, states, t1=0.5, max_impacts=10)
+    assert hops.final.position.dtype == np.float32
+    agree(hops, loop, 1e-3, share=0.97)
+
+
+def test_most_throws_under_a_table_need_no_search(getkey):
+    """Else the quick way would be right and of no use."""
+    room = block_scene("table")
+    noise = np.asarray(jax.random.normal(getkey(), (3, 200, 3)))
+    parts = np.asarray([-0.4, 0.0, 0.9]), np.asarray([2.0, 0.0, -5.0]), np.asarray([0.0, 15.0, 0.0])
+    spread = (0.05, 0.3, 10.0)
+    states = BallState(*(jnp.asarray(x + s * z) for x, s, z in zip(parts, spread, noise, strict=True)))
+
+    def hops(state):
+        t0, t1 = jnp.asarray(0.0), jnp.asarray(1.0)
+        return hopped(start(room, Exact(), room.unpacked(state), t0, t1, 0, 0), room, t1, 16)[0].done
+
+    assert jax.jit(jax.vmap(hops))(states).mean() > 0.8
+
+
 def test_it_stops_before_an_impact_too_many(getkey):
     """In the place, and at the time, of the impact that it may not have."""
     states = throws(getkey(), 300, float)
@@ -142,9 +220,10 @@ def test_marks_can_be_read_back():
 
 
 def test_the_program_has_no_search():
-    """Where the scene is planes and no log is kept, there is one loop more, which hops, within another."""
+    """Where the scene is planes and no log is kept, there are two loops more, which hop: before the search, and within
+    it, for what it was needed for."""
     room = scene("elastic", ("floor",))
     state = BallState([0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     run = lambda size: str(jax.make_jaxpr(lambda s: simulate(room, s, t1=1.0, log_size=size, throw=False))(state))  # noqa: E731
-    assert run(0).count("while[") == 1 + run(4).count("while[")
+    assert run(0).count("while[") == 2 + run(4).count("while[")
     assert Exact().is_closed_form
