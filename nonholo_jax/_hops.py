@@ -1,8 +1,9 @@
-"""Parabolas from plane to plane, each with the impact that ends it, in few passes over a batch.
+"""Parabolas from impact to impact, each with the impact that ends it, in few passes over a batch.
 
-Between planes the next impact is the root of a quadratic, and needs no search. A hop does only what an ordinary bounce
-needs; where there may be more to do (a corner, grazing, bounces that die out, a number that is not finite) it says so,
-and the event loop goes on from there.
+Between planes and the faces of boxes the next impact is the root of a quadratic, at an edge a few steps of Newton's
+method away from one: it needs no search. A hop does only what an ordinary bounce needs; where there may be more to do
+(a corner of a room, grazing, an edge passed closely or slowly, bounces that die out, a number that is not finite) it
+says so, and the event loop goes on from there.
 """
 
 import functools

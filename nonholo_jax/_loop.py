@@ -299,7 +299,13 @@ def _unmarked(mark: Any, bits: int) -> tuple:
 
 def hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows: int = 0) -> tuple[Carry, Any]:
     """The motion as far as it is a row of ordinary impacts, known in closed form, and the choices of the hops, in so
-    many rows. All lanes that hop are at the same impact, so that the number of turns counts their impacts."""
+    many rows."""
+    end = _hops(carry, system, t1, max_impacts, rows)
+    return _landed(carry, end, system, t1), end.path
+
+
+def _hops(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows: int = 0) -> _Hopping:
+    """All lanes that hop are at the same impact, so that the number of turns counts their impacts."""
     bits, hopper = system.n_contacts.bit_length(), system.hopper(carry.state)
     assert hopper is not None
 
@@ -314,14 +320,22 @@ def hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows
         return _Hopping(time, ahead, done.state, mark, c.turn + 1, path)
 
     zero = jnp.asarray(0, dtype=jnp.int32)
-    free = ~carry.done & (carry.s == 0) & (system.phase(carry.state) < 0)
-    mark = jnp.where(free, carry.touching, _stopped(zero, -1, 2, bits))
+    mark = jnp.where(_can_start(carry, system), carry.touching, _stopped(zero, -1, 2, bits))
     path = jnp.full((rows,), int(PAUSES), jnp.int16)
     begin = _Hopping(carry.time, carry.ahead, carry.state, mark, zero, path)
-    end = lax.while_loop(lambda c: eqxi.unvmap_any(c.mark >= -1), hop, begin)
-    n_impacts, touching, why = _unmarked(end.mark, bits)
+    return lax.while_loop(lambda c: eqxi.unvmap_any(c.mark >= -1), hop, begin)
+
+
+def _can_start(carry: Carry, system: AbstractSystem) -> Any:
+    return ~carry.done & (carry.s == 0) & (system.phase(carry.state) < 0)
+
+
+def _landed(carry: Carry, end: _Hopping, system: AbstractSystem, t1: Any) -> Carry:
+    """The carry after hops."""
+    free = _can_start(carry, system)
+    n_impacts, touching, why = _unmarked(end.mark, system.n_contacts.bit_length())
     reached, full, moved = free & (why == 0), free & (why == 1), n_impacts > 0
-    carry = carry._replace(
+    return carry._replace(
         time=jnp.where(reached, t1, end.time),
         ahead=end.ahead,
         state=end.state,
@@ -335,7 +349,6 @@ def hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows
         done=carry.done | reached | full,
         result=RESULTS.where(full, RESULTS.max_impacts, carry.result),
     )
-    return carry, end.path
 
 
 def hopper_of(system: AbstractSystem, motion: AbstractMotion, state: Any, max_impacts: int) -> Hopper | None:
@@ -354,18 +367,31 @@ def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind
     carry = start(system, motion, state, t0, t1, log_rows, 0)
     next_turn = lambda c: turn(c, system, motion, t1, max_impacts)  # noqa: E731
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
-    if kind == "hop":  # what does not get to its end by hops goes on by turns, and, where hops are short, by both
-        hopper = system.hopper(carry.state)
-        next_of = _turned if hopper is not None and hopper.again is not None else turn
-
-        def rest(c: Carry, given: tuple) -> Carry:
-            system, motion, t1 = given
-            return lax.while_loop(going, lambda c: next_of(c, system, motion, t1, max_impacts), c)
-
-        begun, _ = hopped(carry, system, t1, max_impacts)
-        end = where_needed(rest, _STRAGGLERS)(~begun.done, begun, (system, motion, t1))
-    elif kind == "lax":
+    if kind == "hop":
+        return _found_by_hops(carry, system, motion, t1, max_impacts)
+    if kind == "lax":
         end = lax.while_loop(going, next_turn, carry)
     else:
         end = eqxi.while_loop(going, next_turn, carry, kind=kind, max_steps=motion.max_turns(max_impacts))
-    return Outcome(end.time, end.state, end.n_impacts, end.n_arcs, end.result, end.log)
+    return _outcome(end)
+
+
+def _found_by_hops(carry: Carry, system, motion, t1, max_impacts: int) -> Outcome:
+    """What does not get to its end by hops goes on by turns, and, where hops are a short program, by both."""
+    hopper = system.hopper(carry.state)
+    next_of = _turned if hopper is not None and hopper.again is not None else turn
+
+    end = _hops(carry, system, t1, max_impacts)
+    begun = _landed(carry, end, system, t1)
+
+    def rest(_: Outcome, given: tuple) -> Outcome:
+        system, motion, t1, end = given  # a few numbers, of which the carry is made again: it is long
+        c = _landed(start(system, motion, end.state, end.time, t1, 0, 0), end, system, t1)
+        going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
+        return _outcome(lax.while_loop(going, lambda c: next_of(c, system, motion, t1, max_impacts), c))
+
+    return where_needed(rest, _STRAGGLERS)(~begun.done, _outcome(begun), (system, motion, t1, end))
+
+
+def _outcome(c: Carry) -> Outcome:
+    return Outcome(c.time, c.state, c.n_impacts, c.n_arcs, c.result, c.log)

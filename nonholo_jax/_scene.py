@@ -203,8 +203,8 @@ class Scene(AbstractSystem):
         return Hopper(self.hop, None) if known else None
 
     def hop(self, touching, going, full, left, state, dies_out=lambda *_: False):
-        """A parabola from plane to plane; `dies_out(i, wall, speed, left)` says whether bounces may end after an
-        impact."""
+        """A parabola and the impact that ends it; `dies_out(i, wall, speed, left)` says whether bounces may end after
+        an impact."""
         walls, g, kicked = self._hopping(left, state)
         parts = (state.position, state.velocity, state.spin)
         done = hop(walls, g, kicked, dies_out, touching, going, full, left, parts)

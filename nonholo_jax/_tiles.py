@@ -75,8 +75,9 @@ def _like(flags: Any, x: Any) -> Any:
 
 def _gathered(whole: Callable, needed: Any, lanes: Any, many: Any, n: int, size: int) -> Any:
     """Those of the lanes that need it, `size` at a time; a gap in the last group is filled with some lane."""
-    (order,) = jnp.nonzero(needed, size=n + size, fill_value=n)
-    order = order.astype(jnp.int32)
+    none = jnp.full(n + size, n, jnp.int32)
+    some = lambda: jnp.nonzero(needed, size=n + size, fill_value=n)[0].astype(jnp.int32)  # noqa: E731
+    order = lax.cond(jnp.any(needed), some, lambda: none)
 
     def group(k: Any, lanes: Any) -> Any:
         index = lax.dynamic_slice(order, (k * size,), (size,))
@@ -84,8 +85,7 @@ def _gathered(whole: Callable, needed: Any, lanes: Any, many: Any, n: int, size:
         found = whole(some(lanes), some(many))
         return jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), lanes, found)
 
-    count = jnp.sum(needed, dtype=jnp.int32)
-    return lax.fori_loop(0, -(-count // size), group, lanes)
+    return lax.fori_loop(0, -(-jnp.sum(needed, dtype=jnp.int32) // size), group, lanes)
 
 
 def by_tiles(whole: Callable, lanes: Any, n: int, size: int) -> Any:
