@@ -191,21 +191,25 @@ def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion) -> Itera
         left = jnp.where(found.done, 0, jnp.maximum(n_arcs - done, 0) + 2)
         return jnp.minimum(-(-eqxi.unvmap_max(left) // rows), most)
 
-    def step(arguments: Any, i: Any, stays: Any, moving: Any) -> tuple:
+    def look(arguments: Any, i: Any, stays: Any) -> tuple:
         moves, done, found, rest = stays
-        first, (still, way, _, _, end) = rows * i, frozen(arguments)
-        system, motion, _, _, t1 = harmless(arguments, moves)
+        still, way, _, _, end = frozen(arguments)
         empty = Path(jnp.zeros((rows, 2), end.dtype), jnp.full((rows, 2), -1, jnp.int32))
-        search = frozen(_resumed(still, way, end, found._replace(path=empty), first + rows, max_impacts))
-        index = first + jnp.arange(rows, dtype=jnp.int32)
-        steps = jax.tree.map(lambda x: x.reshape(-1, _CHUNK, *x.shape[1:]), (index, *search.path))
+        search = frozen(_resumed(still, way, end, found._replace(path=empty), rows * (i + 1), max_impacts))
+        return (moves, done, search._replace(path=found.path), rest), search.path
+
+    def follow(arguments: Any, i: Any, stays: Any, path: Any, moving: Any) -> tuple:
+        moves, done, search, rest = stays
+        system, motion, _, _, t1 = harmless(arguments, moves)
+        index = rows * i + jnp.arange(rows, dtype=jnp.int32)
+        steps = jax.tree.map(lambda x: x.reshape(-1, _CHUNK, *x.shape[1:]), (index, *path))
         steps = (steps[0], *[(pair[..., 0], pair[..., 1]) for pair in steps[1:]])
         again = _repeat(eqx.combine(moving, rest), steps, system, motion, t1, search)
         moving, rest = eqx.partition(again, eqx.is_inexact_array)
-        return (moves, done, search._replace(path=found.path), rest), moving
+        return (moves, done, search, rest), moving
 
     asked = lambda moving: (moving.time, moving.state, moving.values)  # noqa: E731
-    return Iteration(begin, count, step, lambda stays: stays[2].done, asked, most)
+    return Iteration(begin, count, look, follow, lambda stays: stays[2].done, asked, most)
 
 
 def _find(system, motion, state, t0, t1, **options):

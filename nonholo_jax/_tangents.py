@@ -27,7 +27,9 @@ class Iteration(NamedTuple):
         Callable  # of the arguments: what stays (a pytree without derivatives) and what moves (floating-point arrays)
     )
     count: Callable  # of what stays, and of the hint: how many steps there are to make, the same for all lanes
-    step: Callable  # of the arguments, the number of the step, what stays and what moves: both, afterwards
+    look: Callable  # of the arguments, the number of the step, and what stays: the latter, afterwards, and a path
+    follow: Callable  # of the arguments, the number of the step, what `look` returned, and what moves: what stays and
+    # what moves, afterwards
     finished: Callable  # of what stays: whether there was no step too few
     of: Callable  # of what moves in the end: what is asked for, linear in it
     most: int  # steps
@@ -167,7 +169,8 @@ def _pushed(iteration: Iteration, hint: Any, arguments: Callable, at: list, numb
 
     def step(i: Any, carry: tuple) -> tuple:
         stays, moving, tangent = carry
-        after = lambda at, moving: iteration.step(arguments(at), i, stays, moving)[::-1]  # noqa: E731
+        seen, path = iteration.look(arguments(at), i, stays)
+        after = lambda at, moving: iteration.follow(arguments(at), i, seen, path, moving)[::-1]  # noqa: E731
         moving, tangent, stays = jax.jvp(after, (at, moving), (numbers, tangent), has_aux=True)
         return stays, moving, tangent
 
@@ -180,40 +183,58 @@ def _known(finished: Any, numbers: Any) -> Any:
     return jax.tree.map(lambda x: jnp.where(finished, x, jnp.nan), numbers)
 
 
+class _Pull(NamedTuple):
+    """How far the way back is."""
+
+    part: Any  # the step that comes next, and what it begins with
+    stays: Any
+    moving: Any
+    goal: Any  # the step whose transpose comes next
+    kept: Any  # what steps begin with, in slots
+    cotangent: Any
+    sums: Any
+    finished: Any
+
+
 def _pulled(iteration: Iteration, hint: Any, arguments: Callable, at: list, cotangent: Any) -> list:
-    """The cotangent of the arguments that move. The states between the steps are kept in a few slots; from the nearest
-    one the others are found again."""
+    """The cotangent of the arguments that move. What steps begin with is kept in a few slots; from the nearest one the
+    others are found again, by the same instructions: a path found by others may differ by rounding in where a step
+    ends, and would not fit to the next one."""
     begin = lambda at: iteration.begin(arguments(at))[::-1]  # noqa: E731
     moving, pull, stays = jax.vjp(begin, at, has_aux=True)
     count = iteration.count(stays, hint)
     slots = min(iteration.most, _SLOTS)
     stride = jnp.maximum(-(-count // slots), 1)
-    carry, (cotangent,) = (stays, moving), jax.vjp(iteration.of, moving)[1](cotangent)
-    kept = jax.tree.map(lambda x: jnp.broadcast_to(x, (slots, *jnp.shape(x))), carry)
-    step = lambda i, carry: iteration.step(arguments(at), i, *carry)  # noqa: E731
+    (cotangent,) = jax.vjp(iteration.of, moving)[1](cotangent)
+    kept = jax.tree.map(lambda x: jnp.broadcast_to(x, (slots, *jnp.shape(x))), (stays, moving))
 
-    def on(i: Any, both: tuple) -> tuple:
-        carry, kept = both
-        carry = step(i, carry)
-        slot = jnp.where((i + 1) % stride == 0, (i + 1) // stride, slots)
-        return carry, jax.tree.map(lambda column, x: column.at[slot].set(x, mode="drop"), kept, carry)
+    def job(c: _Pull) -> _Pull:
+        seen, path = iteration.look(arguments(at), c.part, c.stays)
+        after = lambda at, moving: iteration.follow(arguments(at), c.part, seen, path, moving)[::-1]  # noqa: E731
 
-    def back(i: Any, both: tuple) -> tuple:
-        i, (cotangent, sums, finished) = count - 1 - i, both
-        slot = i // stride
-        nearest = jax.tree.map(lambda column: column[slot], kept)
-        stays, moving = lax.fori_loop(slot * stride, i, step, nearest)
-        after = lambda at, moving: iteration.step(arguments(at), i, stays, moving)[::-1]  # noqa: E731
-        _, pull, stays = jax.vjp(after, at, moving, has_aux=True)
-        finished = finished | ((i == count - 1) & iteration.finished(stays))
-        more, cotangent = pull(cotangent)
-        return cotangent, [a + b for a, b in zip(sums, more, strict=True)], finished
+        def back(c: _Pull) -> _Pull:
+            _, pull, ended = jax.vjp(after, at, c.moving, has_aux=True)
+            more, cotangent = pull(c.cotangent)
+            sums = [a + b for a, b in zip(c.sums, more, strict=True)]
+            goal = c.goal - 1
+            slot = jnp.maximum(goal, 0) // stride
+            stays_there, moving_there = jax.tree.map(lambda column: column[slot], c.kept)
+            finished = c.finished | ((c.goal == count - 1) & iteration.finished(ended))
+            return _Pull(slot * stride, stays_there, moving_there, goal, c.kept, cotangent, sums, finished)
 
-    if slots > 1:
-        _, kept = lax.fori_loop(0, jnp.maximum(count - 1, 0) // stride * stride, on, (carry, kept))
-    begun = (cotangent, [jnp.zeros_like(x) for x in at], iteration.finished(stays))
-    cotangent, sums, finished = lax.fori_loop(0, count, back, begun)
-    return _known(finished, [a + b for a, b in zip(sums, pull(cotangent)[0], strict=True)])
+        def on(c: _Pull) -> _Pull:
+            moving, stays = after(at, c.moving)
+            part = c.part + 1
+            slot = jnp.where(part % stride == 0, part // stride, slots)
+            kept = jax.tree.map(lambda column, x: column.at[slot].set(x, mode="drop"), c.kept, (stays, moving))
+            return c._replace(part=part, stays=stays, moving=moving, kept=kept)
+
+        return back(c) if iteration.most == 1 else lax.cond(c.part == c.goal, back, on, c)
+
+    zero, sums = jnp.zeros_like(count), [jnp.zeros_like(x) for x in at]
+    first = _Pull(zero, stays, moving, count - 1, kept, cotangent, sums, iteration.finished(stays))
+    last = lax.while_loop(lambda c: c.goal >= 0, job, first)
+    return _known(last.finished, [a + b for a, b in zip(last.sums, pull(last.cotangent)[0], strict=True)])
 
 
 def _all_steps(iteration: Iteration, hint: Any, arguments: Callable, at: Any) -> Any:
@@ -222,7 +243,12 @@ def _all_steps(iteration: Iteration, hint: Any, arguments: Callable, at: Any) ->
     count = iteration.count(stays, hint)
 
     def step(carry: tuple, i: Any) -> tuple:
-        run = lambda carry: iteration.step(arguments(at), i, *carry)  # noqa: E731
+
+        def run(carry: tuple) -> tuple:
+            stays, moving = carry
+            seen, path = iteration.look(arguments(at), i, stays)
+            return iteration.follow(arguments(at), i, seen, path, moving)
+
         return lax.cond(i < count, run, lambda carry: carry, carry), None
 
     body = step if iteration.most == 1 else jax.checkpoint(step, prevent_cse=False)

@@ -25,6 +25,16 @@ def step(arguments, i, stays, moving):
     return {"odd": stays["odd"] ^ going}, moved
 
 
+def look(arguments, i, stays):
+    return stays, jnp.sin(jnp.asarray(i).astype(float))
+
+
+def follow(arguments, i, stays, path, moving):
+    x, shared, count = arguments
+    stays, moved = step(arguments, i, stays, moving)
+    return stays, {"x": moved["x"], "sum": moved["sum"] + jnp.where(i < count, path * x, 0.0)}
+
+
 def asked(moving):
     return moving["x"], 2.0 * moving["sum"]
 
@@ -32,13 +42,16 @@ def asked(moving):
 def plainly(x, shared, count):
     stays, moving = begin((x, shared, count))
     for i in range(MOST):
-        stays, moving = step((x, shared, count), i, stays, moving)
+        stays, path = look((x, shared, count), i, stays)
+        stays, moving = follow((x, shared, count), i, stays, path, moving)
     return asked(moving)
 
 
 def iteration(steps, finished=True):
     """All lanes make the same number of steps, some of them idle."""
-    return Iteration(begin, lambda _, hint: steps + 0 * hint, step, lambda _: jnp.asarray(finished), asked, MOST)
+    return Iteration(
+        begin, lambda _, hint: steps + 0 * hint, look, follow, lambda _: jnp.asarray(finished), asked, MOST
+    )
 
 
 def tiled(steps, tile, finished=True):
