@@ -384,8 +384,8 @@ def _found_by_hops(carry: Carry, system, motion, t1, max_impacts: int) -> Outcom
     end = _hops(carry, system, t1, max_impacts)
     begun = _landed(carry, end, system, t1)
 
-    def rest(_: Outcome, given: tuple) -> Outcome:
-        system, motion, t1, end = given  # a few numbers, of which the carry is made again: it is long
+    def rest(system, motion, t1, end: _Hopping) -> Outcome:
+        # The carry is long, and is made again of a few numbers.
         c = _landed(start(system, motion, end.state, end.time, t1, 0, 0), end, system, t1)
         going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
         return _outcome(lax.while_loop(going, lambda c: next_of(c, system, motion, t1, max_impacts), c))

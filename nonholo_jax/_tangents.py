@@ -243,7 +243,6 @@ def _all_steps(iteration: Iteration, hint: Any, arguments: Callable, at: Any) ->
     count = iteration.count(stays, hint)
 
     def step(carry: tuple, i: Any) -> tuple:
-
         def run(carry: tuple) -> tuple:
             stays, moving = carry
             seen, path = iteration.look(arguments(at), i, stays)

@@ -40,52 +40,51 @@ def in_tiles(function: Callable, size: int, alone: Callable | None = None) -> Ca
 
 
 def where_needed(function: Callable, size: int) -> Callable:
-    """`call(needed, lanes, rest)`: `function(lanes, rest)`, which is of the form of `lanes`, where it is needed, and
-    `lanes` elsewhere. Under `vmap` on a CPU the lanes that need it are gathered, `size` at a time, so that few of them
-    cost little. Not differentiable in reverse mode."""
+    """`call(needed, otherwise, args)`: `function(*args)` where it is needed, elsewhere `otherwise`, of the same form.
+    Under `vmap` on a CPU the lanes that need it are gathered, `size` at a time, so that few of them cost little. Not
+    differentiable in reverse mode."""
 
-    def call(needed: Any, lanes: Any, rest: Any) -> Any:
-        arrays, constants = eqx.partition(rest, eqx.is_array)
+    def call(needed: Any, otherwise: Any, args: tuple) -> Any:
+        arrays, constants = eqx.partition(args, eqx.is_array)
 
         @custom_vmap
-        def run(needed, lanes, arrays):
-            return lax.cond(needed, lambda lanes: function(lanes, eqx.combine(arrays, constants)), lambda x: x, lanes)
+        def run(needed, otherwise, arrays):
+            return lax.cond(needed, lambda _: function(*eqx.combine(arrays, constants)), lambda x: x, otherwise)
 
         @run.def_vmap
-        def over_lanes(n, in_batched, needed, lanes, arrays):
+        def over_lanes(n, in_batched, needed, otherwise, arrays):
             every = lambda x, batched: x if batched else jnp.broadcast_to(x, (n, *jnp.shape(x)))  # noqa: E731
-            needed, lanes = jax.tree.map(every, (needed, lanes), tuple(in_batched[:2]))
-            many, same = eqx.partition(arrays, in_batched[2])
-            whole = jax.vmap(lambda lanes, many: function(lanes, eqx.combine(many, same, constants)))
+            needed, otherwise = jax.tree.map(every, (needed, otherwise), tuple(in_batched[:2]))
+            lanes, rest = eqx.partition(arrays, in_batched[2])
+            whole = jax.vmap(lambda lanes: function(*eqx.combine(lanes, rest, constants)))
             if n <= size or jax.default_backend() != "cpu":
-                found = whole(lanes, many)
-                out = jax.tree.map(lambda a, b: jnp.where(_like(needed, a), a, b), found, lanes)
+                out = jax.tree.map(lambda a, b: jnp.where(along(needed, a), a, b), whole(lanes), otherwise)
             else:
-                out = _gathered(whole, needed, lanes, many, n, size)
+                out = _gathered(whole, needed, otherwise, lanes, n, size)
             return out, jax.tree.map(lambda _: True, out)
 
-        return run(needed, lanes, arrays)
+        return run(needed, otherwise, arrays)
 
     return call
 
 
-def _like(flags: Any, x: Any) -> Any:
+def along(flags: Any, x: Any) -> Any:
+    """Flags of lanes or of rows, in the shape that goes with an array which has those axes in front."""
     return flags.reshape(flags.shape + (1,) * (x.ndim - flags.ndim))
 
 
-def _gathered(whole: Callable, needed: Any, lanes: Any, many: Any, n: int, size: int) -> Any:
+def _gathered(whole: Callable, needed: Any, otherwise: Any, lanes: Any, n: int, size: int) -> Any:
     """Those of the lanes that need it, `size` at a time; a gap in the last group is filled with some lane."""
     none = jnp.full(n + size, n, jnp.int32)
     some = lambda: jnp.nonzero(needed, size=n + size, fill_value=n)[0].astype(jnp.int32)  # noqa: E731
     order = lax.cond(jnp.any(needed), some, lambda: none)
 
-    def group(k: Any, lanes: Any) -> Any:
+    def group(k: Any, out: Any) -> Any:
         index = lax.dynamic_slice(order, (k * size,), (size,))
-        some = lambda tree: jax.tree.map(lambda x: x.at[index].get(mode="clip"), tree)  # noqa: E731
-        found = whole(some(lanes), some(many))
-        return jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), lanes, found)
+        found = whole(jax.tree.map(lambda x: x.at[index].get(mode="clip"), lanes))
+        return jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), out, found)
 
-    return lax.fori_loop(0, -(-jnp.sum(needed, dtype=jnp.int32) // size), group, lanes)
+    return lax.fori_loop(0, -(-jnp.sum(needed, dtype=jnp.int32) // size), group, otherwise)
 
 
 def by_tiles(whole: Callable, lanes: Any, n: int, size: int) -> Any:

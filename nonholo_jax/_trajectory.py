@@ -12,6 +12,7 @@ from ._loop import Outcome, kind_of, unpack_row
 from ._motion import AbstractMotion
 from ._replay import run
 from ._system import AbstractSystem
+from ._tiles import along
 from ._types import KINDS, RESULTS
 from ._vector import frozen
 
@@ -145,7 +146,7 @@ def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any
     row = unpack_row(values, outcome.state)
     used = contact >= 0
     safe = jax.tree.map(jnp.nan_to_num, frozen(outcome.state))  # harmless numbers for the rows that are not used
-    before = jax.tree.map(lambda a, b: jnp.where(_along(used, a), a, b), row.before, safe)
+    before = jax.tree.map(lambda a, b: jnp.where(along(used, a), a, b), row.before, safe)
     if system.n_contacts > 0:
         point, normal = jax.vmap(system.contact_frame)(contact, row.time, before)
         point, normal = (jnp.where(used[:, None], x, jnp.nan) for x in (point, normal))
@@ -172,10 +173,6 @@ def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any
         system=system,
         motion=motion,
     )
-
-
-def _along(used: Any, x: Any) -> Any:
-    return used.reshape(used.shape + (1,) * (x.ndim - used.ndim))
 
 
 def _rate(system: AbstractSystem, time: Any, state: Any) -> Any:
