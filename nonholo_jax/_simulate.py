@@ -16,7 +16,7 @@ from ._motion_integrated import Integrated
 from ._replay import run
 from ._scene import Scene
 from ._system import AbstractSystem
-from ._tiles import free_devices, over_devices
+from ._tiles import by_tiles, free_devices, over_devices
 from ._trajectory import Trajectory, packaged
 from ._types import is_failure, result_message, result_name
 from ._vector import as_number, as_pair, as_quaternion, as_vector
@@ -208,7 +208,8 @@ def _run_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, log
             whole = packaged(system, motion, state, t0, outcome)
             return dataclasses.replace(whole, system=None, motion=None)
 
-        return jax.vmap(one)(states, mapped)
+        whole = lambda lanes: jax.vmap(one)(*lanes)  # noqa: E731
+        return by_tiles(whole, lanes, len(jax.tree.leaves(states)[0]), motion.tile) if log_rows else whole(lanes)
 
     mapped = [leaf for leaf, axis in zip(moved, axes, strict=True) if axis is not None]
     whole = over_devices(batch, (states, mapped), (arrays, t0, t1), devices)

@@ -1,5 +1,6 @@
 """A batch that runs in tiles is the batch that runs at once, whatever its size, and lane by lane the single motion."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -64,6 +65,28 @@ def test_scene_parameters_in_tiles(getkey):
 
     single = jax.vmap(one)(restitution, state)
     assert np.allclose(stacked(batch.final), stacked(single.final), rtol=0, atol=1e-14)
+
+
+def test_a_log_in_tiles(getkey):
+    """The log of a batch is put together tile by tile: the same rows, derivatives in both modes."""
+    scene, states = scene_of(PLANE, Rough(0.8, tangential=0.4)), throws(PLANE, getkey(), 11)
+
+    def run(motion):
+        def total(shift):
+            moved = dataclasses.replace(states, velocity=states.velocity + shift)
+            batch = simulate_batch(scene, moved, t1=1.0, max_impacts=4, motion=motion)
+            return jnp.nansum(batch.impacts.point * batch.impacts.after.velocity), batch
+
+        shift = jnp.zeros((11, 3))
+        slope, batch = jax.jit(jax.grad(total, has_aux=True))(shift)
+        along = jax.jit(lambda x, d: jax.jvp(lambda x: total(x)[0], (x,), (d,))[1])(shift, jnp.cos(slope))
+        return slope, along, batch.impacts, batch.final
+
+    tiles, whole = run(Exact(tile=4)), run(Exact(tile=1000))
+    assert bool(jnp.any(tiles[2].surface >= 0)) and bool(jnp.any(tiles[2].surface < 0))
+    assert np.allclose(tiles[1], np.sum(tiles[0] * np.cos(tiles[0])), rtol=1e-10)
+    for one, other in zip(jax.tree.leaves(tiles), jax.tree.leaves(whole), strict=True):
+        assert np.allclose(one, other, rtol=0, atol=1e-10, equal_nan=True)
 
 
 DEVICES = """
