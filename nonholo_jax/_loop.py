@@ -18,12 +18,10 @@ from ._hops import ENDS, FULL, PAUSES, Hopper
 from ._motion import AbstractMotion
 from ._shared import shared
 from ._system import AbstractSystem
-from ._tiles import where_needed
 from ._types import KINDS, RESULTS
 from ._vector import frozen, norm
 
 _MOST_IMPACTS_AT_ONCE = 32
-_STRAGGLERS = 16  # lanes that make a turn together
 
 
 class Row(NamedTuple):
@@ -362,13 +360,10 @@ def _turned(c: Carry, system, motion, t1, max_impacts: int) -> Carry:
 
 
 def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = "lax") -> Outcome:
-    """Run the loop. `kind` chooses how the loop itself may be differentiated: "lax" forward, "checkpointed" in reverse,
-    and "hop", quicker where the system can hop, not at all."""
+    """Run the loop. `kind` says how the loop itself may be differentiated: "lax" forward, "checkpointed" in reverse."""
     carry = start(system, motion, state, t0, t1, log_rows, 0)
     next_turn = lambda c: turn(c, system, motion, t1, max_impacts)  # noqa: E731
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
-    if kind == "hop":
-        return _found_by_hops(carry, system, motion, t1, max_impacts)
     if kind == "lax":
         end = lax.while_loop(going, next_turn, carry)
     else:
@@ -376,21 +371,32 @@ def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind
     return _outcome(end)
 
 
-def _found_by_hops(carry: Carry, system, motion, t1, max_impacts: int) -> Outcome:
-    """What does not get to its end by hops goes on by turns, and, where hops are a short program, by both."""
-    hopper = system.hopper(carry.state)
-    next_of = _turned if hopper is not None and hopper.again is not None else turn
+class Begun(NamedTuple):
+    """How far hops have come, beside the outcome."""
 
+    unfinished: Any
+    ahead: Any
+    mark: Any
+
+
+def begin_by_hops(system, motion, state, t0, t1, *, max_impacts: int) -> tuple[Outcome, Begun]:
+    """`find`, as far as it goes by hops. Neither this nor the rest is for derivatives."""
+    carry = start(system, motion, state, t0, t1, 0, 0)
     end = _hops(carry, system, t1, max_impacts)
-    begun = _landed(carry, end, system, t1)
+    c = _landed(carry, end, system, t1)
+    return _outcome(c), Begun(~c.done, end.ahead, end.mark)
 
-    def rest(system, motion, t1, end: _Hopping) -> Outcome:
-        # The carry is long, and is made again of a few numbers.
-        c = _landed(start(system, motion, end.state, end.time, t1, 0, 0), end, system, t1)
-        going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
-        return _outcome(lax.while_loop(going, lambda c: next_of(c, system, motion, t1, max_impacts), c))
 
-    return where_needed(rest, _STRAGGLERS)(~begun.done, _outcome(begun), (system, motion, t1, end))
+def finish(outcome: Outcome, begun: Begun, system, motion, t1, *, max_impacts: int) -> Outcome:
+    """The rest, by turns, and, where hops are a short program, by both. The carry, which is long, is made again."""
+    hopper = system.hopper(outcome.state)
+    next_of = _turned if hopper is not None and hopper.again is not None else turn
+    carry = start(system, motion, outcome.state, outcome.time, t1, 0, 0)
+    nothing = jnp.zeros((0,), jnp.int16)
+    end = _Hopping(outcome.time, begun.ahead, outcome.state, begun.mark, outcome.n_impacts, nothing)
+    going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
+    next_turn = lambda c: next_of(c, system, motion, t1, max_impacts)  # noqa: E731
+    return _outcome(lax.while_loop(going, next_turn, _landed(carry, end, system, t1)))
 
 
 def _outcome(c: Carry) -> Outcome:

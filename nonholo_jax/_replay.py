@@ -23,8 +23,10 @@ from ._loop import (
     Path,
     Row,
     as_arrays,
+    begin_by_hops,
     computed_once,
     find,
+    finish,
     hopped,
     hopper_of,
     keep,
@@ -38,12 +40,13 @@ from ._motion import AbstractMotion
 from ._shared import shared
 from ._system import AbstractSystem
 from ._tangents import Iteration, tangent_of
-from ._tiles import in_tiles
+from ._tiles import in_tiles, unless_batched, where_needed
 from ._types import RESULTS
 from ._vector import frozen
 
 _CHUNK, _ROWS = 4, 32  # arcs: of which none is repeated where all lanes have ended; of one part of a path
-_HOP_TILE = 1024
+_HOP_TILE = 512
+_STRAGGLERS = 64  # lanes that make their turns together
 
 
 class _Replay(NamedTuple):
@@ -221,20 +224,34 @@ def _find(system, motion, state, t0, t1, **options):
     return in_tiles(lambda *primals: find(*primals, **options), motion.tile)(*primals)
 
 
-def _find_by_hops(system, motion, state, t0, t1, *, alone: str, **options):
-    """The same. Hops are so quick that reading and writing counts: what passes into a tile and out of it is the user's
-    form of a state, few arrays instead of many."""
+def _find_by_hops(system, motion, state, t0, t1, *, alone: str, max_impacts: int, log_rows: int):
+    """The same: first all lanes by hops, then those that have not come to an end. Hops are so quick that reading and
+    writing counts: what passes into a tile and out of it is the user's form of a state, few arrays instead of many."""
 
-    def part(kind):
-        def run(system, motion, user, phase, t0, t1):
-            outcome = find(system, motion, system.unpacked(user, phase), t0, t1, kind=kind, **options)
-            return outcome._replace(state=(system.packed(outcome.state), system.phase(outcome.state)))
+    def written(system, outcome):
+        return outcome._replace(state=(system.packed(outcome.state), system.phase(outcome.state)))
 
-        return run
+    def read(system, outcome):
+        return outcome._replace(state=system.unpacked(*outcome.state))
+
+    def first(system, motion, user, phase, t0, t1):
+        state = system.unpacked(user, phase)
+        outcome, begun = begin_by_hops(system, motion, state, t0, t1, max_impacts=max_impacts)
+        return written(system, outcome), begun
+
+    def rest(outcome, begun, system, motion, t1):
+        return written(system, finish(read(system, outcome), begun, system, motion, t1, max_impacts=max_impacts))
+
+    def both(system, motion, user, phase, t0, t1):
+        outcome, begun = in_tiles(first, _HOP_TILE)(system, motion, user, phase, t0, t1)
+        return where_needed(rest, _STRAGGLERS)(begun.unfinished, outcome, (begun, system, motion, t1))
+
+    def by_turns(system, motion, user, phase, t0, t1):
+        options = {"max_impacts": max_impacts, "log_rows": log_rows}
+        return written(system, find(system, motion, system.unpacked(user, phase), t0, t1, **options))
 
     given = (system, motion, system.packed(as_arrays(state, t0.dtype)), system.phase(state), t0, t1)
-    outcome = in_tiles(part("hop"), _HOP_TILE, part(alone))(*given)
-    return outcome._replace(state=system.unpacked(*outcome.state))
+    return read(system, unless_batched(both if alone == "hop" else by_turns, both)(*given))
 
 
 @eqx.filter_custom_jvp

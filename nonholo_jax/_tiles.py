@@ -15,23 +15,33 @@ from jax.custom_batching import custom_vmap
 from jax.sharding import Mesh, PartitionSpec
 
 
-def in_tiles(function: Callable, size: int, alone: Callable | None = None) -> Callable:
-    """The same function of pytrees, which under `vmap` on a CPU runs `size` lanes at a time; `alone` is another way to
-    compute it, for one lane. Not differentiable in reverse mode."""
+def in_tiles(function: Callable, size: int) -> Callable:
+    """The same function of pytrees, which under `vmap` on a CPU runs `size` lanes at a time. Not differentiable in
+    reverse mode."""
+    return _in_a_batch(lambda whole, lanes, n: by_tiles(whole, lanes, n, size), function, function)
+
+
+def unless_batched(alone: Callable, function: Callable) -> Callable:
+    """`alone` for one lane, and under `vmap` another way to compute the same. Not differentiable in reverse mode."""
+    return _in_a_batch(lambda whole, lanes, n: whole(lanes), alone, function)
+
+
+def _in_a_batch(run_all: Callable, alone: Callable, function: Callable) -> Callable:
+    """`run_all(whole, lanes, n)` computes `whole`, which is `function` for many, where it is batched."""
 
     def call(*args):
         arrays, constants = eqx.partition(args, eqx.is_array)
 
         @custom_vmap
         def run(arrays):
-            return (alone or function)(*eqx.combine(arrays, constants))
+            return alone(*eqx.combine(arrays, constants))
 
         @run.def_vmap
         def over_lanes(axis_size, in_batched, arrays):
             (batched,) = in_batched
             lanes, rest = eqx.partition(arrays, batched)
             whole = jax.vmap(lambda lanes: function(*eqx.combine(lanes, rest, constants)))
-            out = by_tiles(whole, lanes, axis_size, size)
+            out = run_all(whole, lanes, axis_size)
             return out, jax.tree.map(lambda _: True, out)
 
         return run(arrays)
@@ -40,25 +50,25 @@ def in_tiles(function: Callable, size: int, alone: Callable | None = None) -> Ca
 
 
 def where_needed(function: Callable, size: int) -> Callable:
-    """`call(needed, otherwise, args)`: `function(*args)` where it is needed, elsewhere `otherwise`, of the same form.
-    Under `vmap` on a CPU the lanes that need it are gathered, `size` at a time, so that few of them cost little. Not
-    differentiable in reverse mode."""
+    """`call(needed, otherwise, args)`: `function(otherwise, *args)` where needed, else `otherwise`. Under `vmap` on a
+    CPU the lanes that need it are gathered, `size` at a time, so that few of them cost little. Not differentiable in
+    reverse mode."""
 
     def call(needed: Any, otherwise: Any, args: tuple) -> Any:
         arrays, constants = eqx.partition(args, eqx.is_array)
 
         @custom_vmap
         def run(needed, otherwise, arrays):
-            return lax.cond(needed, lambda _: function(*eqx.combine(arrays, constants)), lambda x: x, otherwise)
+            return lax.cond(needed, lambda x: function(x, *eqx.combine(arrays, constants)), lambda x: x, otherwise)
 
         @run.def_vmap
         def over_lanes(n, in_batched, needed, otherwise, arrays):
             every = lambda x, batched: x if batched else jnp.broadcast_to(x, (n, *jnp.shape(x)))  # noqa: E731
             needed, otherwise = jax.tree.map(every, (needed, otherwise), tuple(in_batched[:2]))
             lanes, rest = eqx.partition(arrays, in_batched[2])
-            whole = jax.vmap(lambda lanes: function(*eqx.combine(lanes, rest, constants)))
+            whole = jax.vmap(lambda otherwise, lanes: function(otherwise, *eqx.combine(lanes, rest, constants)))
             if n <= size or jax.default_backend() != "cpu":
-                out = jax.tree.map(lambda a, b: jnp.where(along(needed, a), a, b), whole(lanes), otherwise)
+                out = jax.tree.map(lambda a, b: jnp.where(along(needed, a), a, b), whole(otherwise, lanes), otherwise)
             else:
                 out = _gathered(whole, needed, otherwise, lanes, n, size)
             return out, jax.tree.map(lambda _: True, out)
@@ -81,7 +91,7 @@ def _gathered(whole: Callable, needed: Any, otherwise: Any, lanes: Any, n: int, 
 
     def group(k: Any, out: Any) -> Any:
         index = lax.dynamic_slice(order, (k * size,), (size,))
-        found = whole(jax.tree.map(lambda x: x.at[index].get(mode="clip"), lanes))
+        found = whole(*jax.tree.map(lambda x: x.at[index].get(mode="clip"), (out, lanes)))
         return jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), out, found)
 
     return lax.fori_loop(0, -(-jnp.sum(needed, dtype=jnp.int32) // size), group, otherwise)
