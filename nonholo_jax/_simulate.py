@@ -206,7 +206,7 @@ def _run_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, log
             system = jax.tree.unflatten(treedef, each)
             outcome = run(system, motion, system.unpacked(state), t0, t1, **options)
             whole = packaged(system, motion, state, t0, outcome)
-            return dataclasses.replace(whole, system=None, motion=None)
+            return dataclasses.replace(whole, system=None, motion=None, initial=None)
 
         whole = lambda lanes: jax.vmap(one)(*lanes)  # noqa: E731
         return by_tiles(whole, lanes, len(jax.tree.leaves(states)[0]), motion.tile) if log_rows else whole(lanes)
@@ -214,7 +214,8 @@ def _run_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, log
     mapped = [leaf for leaf, axis in zip(moved, axes, strict=True) if axis is not None]
     whole = over_devices(batch, (states, mapped), (arrays, t0, t1), devices)
     flags = tuple(axis is not None for axis in axes) + (False,) * len(jax.tree.leaves(motion))
-    return dataclasses.replace(whole, system=jax.tree.unflatten(treedef, moved), motion=motion, mapped=flags)
+    given = {"system": jax.tree.unflatten(treedef, moved), "motion": motion, "initial": states}  # and not copied
+    return dataclasses.replace(whole, **given, mapped=flags)
 
 
 def _cast(scene: Any, dtype: Any) -> Any:

@@ -85,16 +85,15 @@ def along(flags: Any, x: Any) -> Any:
 
 def _gathered(whole: Callable, needed: Any, otherwise: Any, lanes: Any, n: int, size: int) -> Any:
     """Those of the lanes that need it, `size` at a time; a gap in the last group is filled with some lane."""
-    none = jnp.full(n + size, n, jnp.int32)
-    some = lambda: jnp.nonzero(needed, size=n + size, fill_value=n)[0].astype(jnp.int32)  # noqa: E731
-    order = lax.cond(jnp.any(needed), some, lambda: none)
+    some = lambda: jnp.cumsum(needed, dtype=jnp.int32)  # noqa: E731
+    count = lax.cond(jnp.any(needed), some, lambda: jnp.zeros(n, jnp.int32))
 
     def group(k: Any, out: Any) -> Any:
-        index = lax.dynamic_slice(order, (k * size,), (size,))
+        index = jnp.searchsorted(count, k * size + 1 + jnp.arange(size, dtype=jnp.int32))
         found = whole(*jax.tree.map(lambda x: x.at[index].get(mode="clip"), (out, lanes)))
         return jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), out, found)
 
-    return lax.fori_loop(0, -(-jnp.sum(needed, dtype=jnp.int32) // size), group, otherwise)
+    return lax.fori_loop(0, -(-count[-1] // size), group, otherwise)
 
 
 def by_tiles(whole: Callable, lanes: Any, n: int, size: int) -> Any:
