@@ -12,15 +12,37 @@ from ._diagnostics import (
     slip as slip,
     weak_residual as weak_residual,
 )
+from ._distribution import (
+    AbstractDistribution as AbstractDistribution,
+    Correlated as Correlated,
+    LogNormal as LogNormal,
+    Measured as Measured,
+    Normal as Normal,
+    TruncatedNormal as TruncatedNormal,
+    Uniform as Uniform,
+)
+from ._ensemble import Ensemble as Ensemble
 from ._goal import AbstractGoal as AbstractGoal, HitTarget as HitTarget, Land as Land, ReturnTo as ReturnTo
 from ._impact import collide as collide, projector as projector
 from ._lagrangian import Barrier as Barrier, LagrangianSystem as LagrangianSystem
 from ._law import AbstractContactLaw as AbstractContactLaw, Frictional as Frictional, Rough as Rough, Smooth as Smooth
+from ._measure import (
+    AbstractMeasure as AbstractMeasure,
+    Distance as Distance,
+    FinalPosition as FinalPosition,
+    ImpactCount as ImpactCount,
+    Landing as Landing,
+    LandingTime as LandingTime,
+    Returns as Returns,
+)
+from ._montecarlo import monte_carlo as monte_carlo
 from ._motion import AbstractMotion as AbstractMotion, Exact as Exact
 from ._motion_integrated import Integrated as Integrated
 from ._round import Cylinder as Cylinder, Sphere as Sphere
+from ._sampler import Sampler as Sampler, Vary as Vary
 from ._scene import Scene as Scene
 from ._simulate import SimulationError as SimulationError, simulate as simulate, simulate_batch as simulate_batch
+from ._store import StoreError as StoreError
 from ._surface import (
     AbstractSurface as AbstractSurface,
     Implicit as Implicit,

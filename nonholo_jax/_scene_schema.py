@@ -4,79 +4,54 @@ import difflib
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import Field, ValidationError, model_validator
 
-SCHEMA = 1
-
-
-class SceneError(ValueError):
-    """A scene file cannot be used; the message is one line that names file, field, value and remedy."""
-
-
-def _fault(requirement: str, remedy: str, field: str = "") -> PydanticCustomError:
-    """A fault that pydantic has no words for. `field` is relative to the table that was validated."""
-    return PydanticCustomError("fault", "{requirement}", {"requirement": requirement, "remedy": remedy, "field": field})
-
-
-def _directed(vector: list[float]) -> list[float]:
-    length = math.hypot(*vector)
-    if length == 0:
-        raise _fault("must not be the zero vector", "give it any length but zero")
-    if not 1e-100 < length < 1e100:
-        raise _fault("must have a length between 1e-100 and 1e100", "only its direction counts, so use length 1")
-    return vector
-
-
-def _ordered(pair: list[float]) -> list[float]:
-    if not pair[0] < pair[1]:
-        raise _fault("must be [low, high] with low < high", "exchange or move the two")
-    return pair
+from ._montecarlo_schema import MEASURES, VARY, MonteCarloTable
+from ._schema_types import (
+    SCHEMA as SCHEMA,
+    Bounds,
+    Direction,
+    Finite,
+    Lengths3,
+    Name,
+    NotNegative,
+    Positive,
+    Quaternion,
+    Restitution,
+    SceneError as SceneError,
+    Table,
+    Tangential,
+    Vector2,
+    Vector3,
+    fault,
+)
 
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Vector2 = Annotated[list[Positive], Field(min_length=2, max_length=2)]
-Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
-Lengths3 = Annotated[list[Positive], Field(min_length=3, max_length=3)]
-Direction = Annotated[Vector3, AfterValidator(_directed)]
-Quaternion = Annotated[list[Finite], Field(min_length=4, max_length=4), AfterValidator(_directed)]
-Restitution = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Tangential = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
-Bounds = Annotated[list[float], Field(min_length=2, max_length=2), AfterValidator(_ordered)]
-Name = Annotated[str, Field(pattern=r"^[\w-]+$")]
-
-
-class _Table(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
-
-class BallTable(_Table):
+class BallTable(Table):
     radius: Positive
     mass: Positive
     inertia_ratio: Positive = 0.4
 
 
-class AirTable(_Table):
+class AirTable(Table):
     density: NotNegative = 1.204
     drag: NotNegative = 0.47
     lift: Finite = 1.0
     wind: Vector3 = [0.0, 0.0, 0.0]
 
 
-class RoughTable(_Table):
+class RoughTable(Table):
     kind: Literal["rough"]
     restitution: Restitution = 1.0
     tangential: Tangential | None = None
 
 
-class SmoothTable(_Table):
+class SmoothTable(Table):
     kind: Literal["smooth"]
     restitution: Restitution = 1.0
 
 
-class FrictionalTable(_Table):
+class FrictionalTable(Table):
     kind: Literal["frictional"]
     restitution: Restitution
     tangential: Tangential
@@ -86,14 +61,14 @@ class FrictionalTable(_Table):
 LawTable = Annotated[RoughTable | SmoothTable | FrictionalTable, Field(discriminator="kind")]
 
 
-class PlaneTable(_Table):
+class PlaneTable(Table):
     shape: Literal["plane"]
     point: Vector3
     normal: Direction
     law: LawTable
 
 
-class RectangleTable(_Table):
+class RectangleTable(Table):
     shape: Literal["rectangle"]
     center: Vector3
     normal: Direction
@@ -106,11 +81,11 @@ class RectangleTable(_Table):
         (a, b, c), (x, y, z) = self.normal, self.tangent
         lengths = math.hypot(a, b, c) * math.hypot(x, y, z)
         if math.hypot(b * z - c * y, c * x - a * z, a * y - b * x) <= 1e-12 * lengths:
-            raise _fault("must not be along `normal`", "choose the direction of the first side", "tangent")
+            raise fault("must not be along `normal`", "choose the direction of the first side", "tangent")
         return self
 
 
-class BoxTable(_Table):
+class BoxTable(Table):
     shape: Literal["box"]
     center: Vector3
     half_size: Lengths3
@@ -118,7 +93,7 @@ class BoxTable(_Table):
     rotation: Quaternion | None = None
 
 
-class SphereTable(_Table):
+class SphereTable(Table):
     shape: Literal["sphere"]
     center: Vector3
     radius: Positive
@@ -126,7 +101,7 @@ class SphereTable(_Table):
     inside: bool = False
 
 
-class CylinderTable(_Table):
+class CylinderTable(Table):
     shape: Literal["cylinder"]
     point: Vector3
     axis: Direction
@@ -140,14 +115,14 @@ SurfaceTable = Annotated[
 ]
 
 
-class ThrowTable(_Table):
+class ThrowTable(Table):
     position: Vector3
     velocity: Vector3
     spin: Vector3
     orientation: Quaternion | None = None
 
 
-class SimulateTable(_Table):
+class SimulateTable(Table):
     t1: Finite
     t0: Finite = 0.0
     max_impacts: Annotated[int, Field(ge=0, le=1_000_000)] = 64
@@ -162,24 +137,24 @@ class SimulateTable(_Table):
     @model_validator(mode="after")
     def _fits_together(self):
         if not self.t1 > self.t0:
-            raise _fault(f"must be later than t0 = {self.t0}", "it is the time in s at which the simulation ends", "t1")
+            raise fault(f"must be later than t0 = {self.t0}", "it is the time in s at which the simulation ends", "t1")
         for name in ("solver", "rtol", "atol", "dt0", "max_steps"):
             if getattr(self, name) is not None and self.motion != "integrated":
-                raise _fault('must come with motion = "integrated"', "add that line or remove this one", name)
+                raise fault('must come with motion = "integrated"', "add that line or remove this one", name)
         return self
 
 
-class ReturnToTable(_Table):
+class ReturnToTable(Table):
     kind: Literal["return_to"]
     point: Vector3
 
 
-class HitTargetTable(_Table):
+class HitTargetTable(Table):
     kind: Literal["hit_target"]
     point: Vector3
 
 
-class LandTable(_Table):
+class LandTable(Table):
     kind: Literal["land"]
     point: Vector3
     surface: str | None = None
@@ -188,7 +163,7 @@ class LandTable(_Table):
 GoalTable = Annotated[ReturnToTable | HitTargetTable | LandTable, Field(discriminator="kind")]
 
 
-class DesignTable(_Table):
+class DesignTable(Table):
     free: Annotated[list[str], Field(min_length=1)]
     goal: GoalTable
     itinerary: Annotated[list[str], Field(min_length=1)] | None = None
@@ -197,7 +172,7 @@ class DesignTable(_Table):
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
 
 
-class Document(_Table):
+class Document(Table):
     """A whole scene file."""
 
     schema_: int = Field(alias="schema")
@@ -208,6 +183,7 @@ class Document(_Table):
     throw: ThrowTable
     simulate: SimulateTable | None = None
     design: DesignTable | None = None
+    monte_carlo: MonteCarloTable | None = None
 
 
 SURFACES = {"plane": PlaneTable, "rectangle": RectangleTable, "box": BoxTable, "sphere": SphereTable,
@@ -215,7 +191,7 @@ SURFACES = {"plane": PlaneTable, "rectangle": RectangleTable, "box": BoxTable, "
 LAWS = {"rough": RoughTable, "smooth": SmoothTable, "frictional": FrictionalTable}
 GOALS = {"return_to": ReturnToTable, "hit_target": HitTargetTable, "land": LandTable}
 _TABLES = {"ball": BallTable, "air": AirTable, "throw": ThrowTable, "simulate": SimulateTable, "design": DesignTable,
-           **SURFACES, **LAWS, **GOALS}  # fmt: skip
+           "monte_carlo": MonteCarloTable, **SURFACES, **LAWS, **GOALS, **VARY, **MEASURES}  # fmt: skip
 
 _EXAMPLES = {
     "radius": "radius = 0.025 (metres)",
@@ -264,6 +240,24 @@ _EXAMPLES = {
     "simulate": "[simulate] with t1 = 2.0",
     "design": "[design] with free and goal",
     "schema": f"schema = {SCHEMA}",
+    "monte_carlo": "[monte_carlo] with n = 100_000, and [[monte_carlo.vary]]",
+    "n": "n = 100_000",
+    "vary": '[[monte_carlo.vary]] with names = ["velocity"], kind = "normal" and std = 0.05',
+    "measure": '[[monte_carlo.measure]] with name = "landing", kind = "landing" and surface = "floor"',
+    "names": 'names = ["velocity"]',
+    "name": 'name = "landing"',
+    "std": "std = 0.05",
+    "sigma": "sigma = 0.02",
+    "low": "low = 0.7",
+    "high": "high = 0.9",
+    "covariance": "covariance = [[0.04, -0.01], [-0.01, 0.02]]",
+    "file": 'file = "throws.csv"',
+    "columns": 'columns = ["vx", "vz"]',
+    "within": "within = 0.1 (metres)",
+    "after": "after = 1",
+    "count": "count = 1",
+    "surface": 'surface = "floor"',
+    "sequence": 'sequence = "sobol"',
 }
 
 
@@ -306,6 +300,22 @@ def nearest(name: str, known: Any, otherwise: str = "choose one of these") -> st
     return f"did you mean {close[0]!r}?" if close else otherwise
 
 
+_LISTS = (
+    "free",
+    "itinerary",
+    "half_size",
+    "vary",
+    "measure",
+    "names",
+    "columns",
+    "covariance",
+    "std",
+    "mean",
+    "low",
+    "high",
+)
+
+
 def dotted(path: tuple) -> str:
     """A path in a document as one name; components of vectors are called by their letters."""
     text = ""
@@ -313,12 +323,25 @@ def dotted(path: tuple) -> str:
         if isinstance(part, int):
             before = path[i - 1]
             letters = "wxyz" if before in ("orientation", "rotation") else "xyz"
-            named = before not in ("free", "itinerary", "half_size") and "bounds" not in path and part < len(letters)
+            named = before not in _LISTS and "bounds" not in path and part < len(letters)
             text += f".{letters[part]}" if named else f"[{part}]"
         else:
             plain = bool(part) and all(c.isalnum() or c in "_-" for c in part)
             text += ("." if text else "") + (part if plain else repr(part))
     return text
+
+
+def _in_list(path: tuple) -> bool:
+    return len(path) == 3 and path[0] == "monte_carlo" and path[1] in ("vary", "measure")
+
+
+def _options(path: tuple) -> dict[str, Any]:
+    """What the tag at the end of a path may be."""
+    if path[-1] == "shape":
+        return SURFACES
+    if _in_list(path[:-1]):
+        return VARY if path[1] == "vary" else MEASURES
+    return LAWS if path[-2] == "law" else GOALS
 
 
 def _untagged(location: tuple) -> tuple:
@@ -329,7 +352,7 @@ def _untagged(location: tuple) -> tuple:
         if not skip:
             path.append(part)
         before = tuple(path)
-        is_union = before[-1] in ("law", "goal") or (len(before) == 2 and before[0] == "surfaces")
+        is_union = before[-1] in ("law", "goal") or (len(before) == 2 and before[0] == "surfaces") or _in_list(before)
         skip = is_union and not skip and i + 1 < len(location) and location[i + 1] in _TABLES
     return tuple(path)
 
@@ -352,7 +375,7 @@ def _sentence(fault: Any, document: dict[str, Any]) -> str:
         return f"`{dotted(path)}` must be given, but got nothing; add {_example(path)}"
     if kind == "union_tag_not_found":
         path = (*path, context["discriminator"].strip("'"))
-        options = SURFACES if path[-1] == "shape" else LAWS if path[-2] == "law" else GOALS
+        options = _options(path)
         return f"`{dotted(path)}` must be given, but got nothing; add {path[-1]} = one of {_listed(options)}"
     if kind == "union_tag_invalid":
         return _unknown_tag((*path, context["discriminator"].strip("'")), context["tag"])
@@ -408,7 +431,7 @@ def _unknown_field(location: tuple, path: tuple, value: Any) -> str:
 
 
 def _unknown_tag(path: tuple, tag: Any) -> str:
-    options = SURFACES if path[-1] == "shape" else LAWS if path[-2] == "law" else GOALS
+    options = _options(path)
     remedy = nearest(str(tag), options)
     if path[-1] == "shape" and str(tag).lower() == "implicit":
         remedy = "an implicit surface is a function: build it in Python with nonholo_jax.Implicit"

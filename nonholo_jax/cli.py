@@ -13,10 +13,13 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from . import _clock
+from ._report import finite, motion_of, state_of, table_of, unit_of
 
 DONE, BAD_INPUT, FAILED = 0, 2, 3
-_UNITS = {"position": "m", "velocity": "m/s", "spin": "rad/s", "gravity": "m/s^2", "point": "m", "center": "m",
-          "radius": "m", "half_size": "m", "mass": "kg", "wind": "m/s", "density": "kg/m^3"}  # fmt: skip
+
+
+_TABLES = (("simulate", "t1 = 2.0"), ("design", 'free = ["spin.y"] and a goal'),
+           ("monte_carlo", "n = 100_000 and [[monte_carlo.vary]]"))  # fmt: skip
 
 
 class _BadInput(Exception):
@@ -53,7 +56,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         options = _parser().parse_args(argv)
         if argv is None:
-            _compile_fast()
+            _choose_for_xla(options.verb)
         return _run(options, from_start=argv is None)
     except _BadInput as error:
         print(f"nonholo: {' '.join(str(error).split())}", file=sys.stderr)
@@ -68,6 +71,8 @@ def main(argv: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     what = "Rough balls that fly and bounce: simulate a throw, design one, or measure error against time."
     codes = "Exit code: 0 done, 2 bad input, 3 the computation failed."
+    from ._montecarlo_verb import add_options
+
     parser = _Parser("nonholo", description=what, epilog=codes, allow_abbrev=False)
     parser.add_argument("--version", action="version", version=f"nonholo_jax {metadata.version('nonholo_jax')}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
@@ -75,6 +80,7 @@ def _parser() -> argparse.ArgumentParser:
         ("simulate", "simulate the throw of a scene file"),
         ("design", "find the throw that reaches the goal of a scene file"),
         ("tradeoff", "measure error against time for every way to run a scene file"),
+        ("montecarlo", "draw many throws of a scene file and say what they do"),
     ):
         each = verbs.add_parser(verb, help=purpose, description=purpose.capitalize() + ".", allow_abbrev=False)
         each.add_argument("scene", metavar="SCENE.toml", help="scene file; see experiments/scenes for examples")
@@ -83,6 +89,9 @@ def _parser() -> argparse.ArgumentParser:
         each.add_argument("--no-plot", action="store_true", help="draw no picture")
         if verb != "tradeoff":
             each.add_argument("--float32", action="store_true", help="compute in float32 instead of float64")
+        if verb == "montecarlo":
+            add_options(each)
+        if verb != "tradeoff":
             continue
         each.set_defaults(float32=False)
         each.add_argument("-n", "--throws", type=int, default=256, help="size of the batch (default: %(default)s)")
@@ -96,37 +105,44 @@ def _parser() -> argparse.ArgumentParser:
 def _run(options: argparse.Namespace, from_start: bool) -> int:
     began = time.perf_counter()
     with _precision(options.float32):
-        from .scene_file import SceneError, load_scene
+        from .scene_file import load_scene
 
         whole = _clock.CPU_BEFORE + time.perf_counter() - _clock.BEGAN
         importing = whole if from_start else time.perf_counter() - began
         try:
+            if options.verb == "montecarlo":
+                _join(options)
             file = load_scene(options.scene)
-        except SceneError as error:
+        except ValueError as error:
             raise _BadInput(str(error)) from None
-        for table, example in (("simulate", "t1 = 2.0"), ("design", 'free = ["spin.y"] and a goal')):
-            if table in ("simulate", options.verb) and getattr(file, table) is None:
+        for table, example in _TABLES:
+            if table in ("simulate", options.verb.replace("monte", "monte_")) and getattr(file, table) is None:
                 what = f"`{table}` must be given for nonholo {options.verb}, but got nothing"
                 raise _BadInput(f"{options.scene}: {what}; add [{table}] with {example}")
-        writes = options.verb == "tradeoff" or not options.no_plot
-        folder = _writable(options.out, options.scene) if writes else None
+        writes = options.verb in ("tradeoff", "montecarlo") or not options.no_plot
+        folder = options.folder = _writable(options) if writes else None
         clock = _CompileClock()
         if sys.stderr.isatty():
             print(f"nonholo: compiling the {options.verb}; this takes most of the time", file=sys.stderr, flush=True)
         try:
             answer = _VERBS[options.verb](file, options)
         except ValueError as error:  # arguments that only the computation itself can judge
-            if not str(error).startswith("Argument "):
+            if not (str(error).startswith("Argument ") or type(error).__name__ == "StoreError"):
                 raise  # a fault of ours
             raise _BadInput(f"{options.scene}: {error}") from None
+        except KeyboardInterrupt:
+            if options.verb != "montecarlo":
+                raise
+            print(f"nonholo: interrupted; whole chunks are kept in {folder}: go on with --resume", file=sys.stderr)
+            return FAILED
         seconds = {"import": importing, **clock.split()}
         picture = None
         if folder is not None and not options.no_plot:
             began = time.perf_counter()
-            picture = _draw(file.scene, answer, folder)
+            picture = _draw(options.verb, file.scene, answer, folder)
             seconds["plot"] = time.perf_counter() - began
         if folder is not None and options.verb == "tradeoff":
-            _written(_finite(answer.report), folder / "tradeoff.json")
+            _written(finite(answer.report), folder / "tradeoff.json")
         _show(options, answer, seconds, picture)
     if answer.failure is not None:
         print(f"nonholo: {options.scene}: {' '.join(answer.failure.split())}", file=sys.stderr)
@@ -134,13 +150,29 @@ def _run(options: argparse.Namespace, from_start: bool) -> int:
     return DONE
 
 
-def _compile_fast() -> None:
-    """Ask JAX 0.10 for XLA's older code generator on the CPU: compilation takes three quarters of the time, and one
-    motion runs as fast. Other versions may not know that flag, and XLA stops at a flag that it does not know."""
-    flag = "--xla_cpu_use_fusion_emitters="
+def _join(options: argparse.Namespace) -> None:
+    """Become one of several processes, if asked to; one that dies may come back while the others wait."""
+    import jax
+
+    from ._montecarlo_verb import processes
+
+    given = processes(options)
+    if given is not None:
+        jax.config.update("jax_enable_recoverability", True)
+        jax.distributed.initialize(*given)
+
+
+def _choose_for_xla(verb: str) -> None:
+    """Make every core a device of its own for a batch that spreads over devices. And ask JAX 0.10 for XLA's older code
+    generator on the CPU: compilation takes three quarters of the time, and one motion runs as fast. Other versions may
+    not know that flag, and XLA stops at a flag that it does not know. What is chosen already stays."""
+    flags = {"--xla_cpu_use_fusion_emitters=": "false"} if metadata.version("jaxlib").startswith("0.10.") else {}
+    if verb == "montecarlo":
+        flags["--xla_force_host_platform_device_count="] = str(len(os.sched_getaffinity(0)))
     chosen = os.environ.get("XLA_FLAGS", "")
-    if metadata.version("jaxlib").startswith("0.10.") and flag not in chosen:
-        os.environ["XLA_FLAGS"] = f"{chosen} {flag}false".strip()
+    more = [flag + value for flag, value in flags.items() if flag not in chosen]
+    if more:
+        os.environ["XLA_FLAGS"] = " ".join([chosen, *more]).strip()
 
 
 @contextlib.contextmanager
@@ -186,9 +218,11 @@ class _CompileClock:
         return {"compile": compiling, "run": total - compiling}
 
 
-def _writable(out: str | None, scene: str) -> Path:
-    """The folder of the picture, made if need be."""
-    folder = Path("nonholo-out") / Path(scene).stem if out is None else Path(out)
+def _writable(options: argparse.Namespace) -> Path:
+    """The folder of what is written, made if need be."""
+    own = Path("nonholo-out") / Path(options.scene).stem
+    own = own / "montecarlo" if options.verb == "montecarlo" else own
+    folder = own if options.out is None else Path(options.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
@@ -202,15 +236,17 @@ def _writable(out: str | None, scene: str) -> Path:
     return folder
 
 
-def _draw(scene: Any, answer: _Answer, folder: Path) -> str | None:
+def _draw(verb: str, scene: Any, answer: _Answer, folder: Path) -> str | None:
     """Write the picture; `None` where there is nothing to draw, which the answer then says."""
+    from ._ensemble_plot import plot_ensemble
     from ._tradeoff_plot import plot_tradeoff
     from .plot import plot_trajectory
 
-    path = folder / ("trajectory.png" if answer.trajectory is not None else "tradeoff.png")
+    draw = {"tradeoff": plot_tradeoff, "montecarlo": plot_ensemble}.get(verb)
+    path = folder / ("trajectory.png" if draw is None else f"{verb}.png")
     try:
-        if answer.trajectory is None:
-            plot_tradeoff(**answer.drawing, path=path)
+        if draw is not None:
+            draw(**answer.drawing, path=path)
         else:
             plot_trajectory(scene, answer.trajectory, path=path, **answer.drawing)
     except ValueError as error:
@@ -245,61 +281,10 @@ def _simulate(file: Any, options: argparse.Namespace) -> _Answer:
     trajectory = simulate(file.scene, file.throw, **file.simulate.arguments, throw=False)
     jax.block_until_ready(trajectory.t1)
     result = result_name(trajectory.result)
-    report = {"throw": _state(file.throw), "result": result, **_motion(file.scene, trajectory)}
-    text = [f"{result}: {result_message(trajectory.result)}", "", *_table(report)]
+    report = {"throw": state_of(file.throw), "result": result, **motion_of(file.scene, trajectory)}
+    text = [f"{result}: {result_message(trajectory.result)}", "", *table_of(report)]
     failure = f"{result}: {result_message(trajectory.result)}" if bool(is_failure(trajectory.result)) else None
     return _Answer(report, text, trajectory, {}, failure)
-
-
-def _state(state: Any) -> dict[str, list[float]]:
-    names = ("position", "velocity", "spin", "orientation")
-    fields = {name: getattr(state, name) for name in names}
-    return {name: [float(x) for x in value] for name, value in fields.items() if value is not None}
-
-
-def _energy(scene: Any, state: dict[str, list[float]]) -> float:
-    """Kinetic and potential energy in J, of a state as it is reported."""
-    ball, v, w = scene.ball, state["velocity"], state["spin"]
-    kinetic = (
-        0.5
-        * ball.mass
-        * (math.fsum(x * x for x in v) + ball.inertia_ratio * ball.radius**2 * math.fsum(x * x for x in w))
-    )
-    return float(kinetic - ball.mass * math.fsum(g * x for g, x in zip(scene.gravity, state["position"], strict=True)))
-
-
-def _motion(scene: Any, trajectory: Any) -> dict[str, Any]:
-    """The part of a report that every verb has."""
-    import jax
-    import numpy as np
-
-    from ._types import kind_name, surfaces_hit
-
-    log = jax.tree.map(np.asarray, trajectory.impacts)
-    impacts = []
-    for i in range(min(int(trajectory.n_impacts), len(log.time))):
-        before, after = (jax.tree.map(lambda x, i=i: x[i], each) for each in (log.before, log.after))
-        impacts.append(
-            {
-                "time": float(log.time[i]),
-                "surface": scene.names[int(log.surface[i])],
-                "kind": kind_name(log.kind, i),
-                "until": float(log.until[i]),
-                "support": scene.names[int(log.support[i])] if log.support[i] >= 0 else None,
-                "point": [float(x) for x in log.point[i]],
-                "normal": [float(x) for x in log.normal[i]],
-                "before": _state(before),
-                "after": _state(after),
-            }
-        )
-    final, initial = _state(trajectory.final), _state(trajectory.initial)
-    return {
-        "itinerary": list(surfaces_hit(scene.names, log)),
-        "impacts": impacts,
-        "final": final,
-        "time": float(trajectory.t1),
-        "energy": {"initial": _energy(scene, initial), "final": _energy(scene, final)},
-    }
 
 
 def _design(file: Any, options: argparse.Namespace) -> _Answer:
@@ -318,7 +303,7 @@ def _design(file: Any, options: argparse.Namespace) -> _Answer:
     reached = int((answer.starts.met & (answer.starts.miss <= answer.tolerance)).sum())
     starts = answer.report()
     report = {
-        "throw": _state(answer.state),
+        "throw": state_of(answer.state),
         "found": dict(zip(answer.names, values, strict=True)),
         "miss": float(answer.miss),
         "loss": float(answer.loss),
@@ -326,14 +311,14 @@ def _design(file: Any, options: argparse.Namespace) -> _Answer:
         "evaluations": answer.evaluations,
         "starts": {"count": len(starts), "reached": reached, "report": starts},
         "result": result_name(answer.trajectory.result),
-        **_motion(answer.scene, answer.trajectory),
+        **motion_of(answer.scene, answer.trajectory),
     }
     head = "found" if answer.converged else "not found; the closest miss is"
     text = [f"{head}, by {len(starts)} starts and {answer.evaluations} trajectories:", ""]
     width = max(len(name.removeprefix("throw.")) for name in answer.names)
-    text += [f"  {name.removeprefix('throw.'):<{width}} = {x!r} {_unit(name)}".rstrip()
+    text += [f"  {name.removeprefix('throw.'):<{width}} = {x!r} {unit_of(name)}".rstrip()
              for name, x in report["found"].items()]  # fmt: skip
-    text += [f"  miss {answer.miss:.3g} m, {reached} of {len(starts)} starts reached the goal", "", *_table(report)]
+    text += [f"  miss {answer.miss:.3g} m, {reached} of {len(starts)} starts reached the goal", "", *table_of(report)]
     failure = None
     if not answer.converged:
         text += ["", "what each start did:", *(f"  {line}" for line in starts)]
@@ -366,7 +351,7 @@ def _tradeoff(file: Any, options: argparse.Namespace) -> _Answer:
     wanted = f"{options.error:g} m"
     best = found.cheapest(options.error)
     report = {
-        "throw": _state(file.throw),
+        "throw": state_of(file.throw),
         "batch": {"throws": options.throws, "spread": options.spread, "seed": options.seed},
         **found.report(),
         "error": options.error,
@@ -382,6 +367,13 @@ def _tradeoff(file: Any, options: argparse.Namespace) -> _Answer:
         us = 1e6 * best.seconds_per_trajectory
         text += ["", f"cheapest for {wanted}: {best.label}: {us:.1f} us, largest error {best.max_error:.1e} m"]
     return _Answer(report, text, None, {"found": found}, failure)
+
+
+def _montecarlo(file: Any, options: argparse.Namespace) -> _Answer:
+    from ._montecarlo_verb import report, run, table
+
+    found = run(file, options, options.folder, progress=sys.stderr.isatty())
+    return _Answer({"throw": state_of(file.throw), **report(found)}, table(found), None, {"found": found}, None)
 
 
 def _scattered(file: Any, n: int, spread: float, seed: int) -> Any:
@@ -403,65 +395,17 @@ def _scattered(file: Any, n: int, spread: float, seed: int) -> Any:
     return BallState(*fields, orientation=turned)
 
 
-_VERBS = {"simulate": _simulate, "design": _design, "tradeoff": _tradeoff}
+_VERBS = {"simulate": _simulate, "design": _design, "tradeoff": _tradeoff, "montecarlo": _montecarlo}
 
 
 # Printing
-
-_LABELS = {
-    "bounce": "{}",
-    "train": "{}, dies out",
-    "rolling": "{}, rolling",
-    "left": "over the edge of {}",
-    "gripped": "{}, slips no more",
-}
-
-
-def _unit(name: str) -> str:
-    """The SI unit of a number by its name in the grammar of scene files."""
-    parts = [part for part in name.split(".") if part not in ("w", "x", "y", "z")]
-    return _UNITS.get(parts[-1], "")
-
-
-def _triple(vector: list[float]) -> str:
-    return " ".join(f"{0.0 if abs(x) < 5e-5 else x:9.4f}" for x in vector)
-
-
-def _table(report: dict[str, Any]) -> list[str]:
-    """The throw, every impact and the end, one aligned line each."""
-    impacts = report["impacts"]
-    labels = [_LABELS[impact["kind"]].format(impact["surface"]) for impact in impacts]
-    width = max([len("surface"), *map(len, labels)])
-    lines = [
-        f"  {'time':>8}  {'':{width}}  {'position':^29}  {'velocity after':^29}  {'spin after':^29}",
-        f"  {'s':>8}  {'surface':{width}}  {'m':^29}  {'m/s':^29}  {'rad/s':^29}",
-    ]
-    rows = [(None, "(throw)", report["throw"])]
-    rows += [(impact["until"], label, impact["after"]) for impact, label in zip(impacts, labels, strict=True)]
-    rows.append((report["time"], "(end)", report["final"]))
-    for moment, label, state in rows:
-        clock = "" if moment is None else f"{moment:.5f}"
-        vectors = "  ".join(_triple(state[name]) for name in ("position", "velocity", "spin"))
-        lines.append(f"  {clock:>8}  {label:{width}}  {vectors}")
-    energy = report["energy"]
-    lines += ["", f"  itinerary: {', '.join(report['itinerary']) or 'no impact'}"]
-    return [*lines, f"  energy: {energy['initial']:.6g} J at the throw, {energy['final']:.6g} J at the end"]
-
-
-def _finite(value: Any) -> Any:
-    """The same tree with null for what JSON has no word for."""
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _show(options: argparse.Namespace, answer: _Answer, seconds: dict[str, float], picture: str | None) -> None:
     if options.json:
         head = {"verb": options.verb, "scene": options.scene, "dtype": "float32" if options.float32 else "float64"}
         whole = head | answer.report | {"seconds": seconds, "picture": picture}
-        print(json.dumps(_finite(whole), allow_nan=False), flush=True)
+        print(json.dumps(finite(whole), allow_nan=False), flush=True)
         return
     print(f"{options.scene}: " + "\n".join(answer.text))
     if picture is not None:

@@ -16,6 +16,7 @@ from ._ball import Ball, BallState
 from ._box import Box, Rectangle
 from ._goal import HitTarget, Land, ReturnTo
 from ._law import Frictional, Rough, Smooth
+from ._montecarlo_file import MonteCarloTask as MonteCarloTask, table_of, task_of
 from ._motion import AbstractMotion, Exact
 from ._motion_integrated import Integrated
 from ._names import expand
@@ -68,14 +69,13 @@ class DesignTask(NamedTuple):
 
 
 class SceneFile(NamedTuple):
-    """What a scene file holds. `simulate` and `design` are `None` where the file has no such table; `monte_carlo` is
-    reserved and always `None` in schema 1."""
+    """What a scene file holds. `simulate`, `design` and `monte_carlo` are `None` where the file has no such table."""
 
     scene: Scene
     throw: BallState
     simulate: SimulateTask | None = None
     design: DesignTask | None = None
-    monte_carlo: None = None
+    monte_carlo: MonteCarloTask | None = None
 
 
 _SHAPE_CLASSES = {"plane": Plane, "rectangle": Rectangle, "box": Box, "sphere": Sphere, "cylinder": Cylinder}
@@ -104,7 +104,7 @@ def load_scene(path: str | Path) -> SceneFile:
     ```
     """
     try:
-        return _built(parse(_read(Path(path))))
+        return _built(parse(_read(Path(path))), Path(path).parent)
     except SceneError as error:
         raise SceneError(_one_line(f"{path}: {error}")) from None
 
@@ -127,7 +127,7 @@ def save_scene(file: SceneFile, path: str | Path) -> None:
     """
     try:
         document = parse(_tables(file))
-        _built(document)
+        _built(document, Path(path).parent)
     except SceneError as error:
         raise SceneError(_one_line(f"{path}: {error}")) from None
     lines = _emitted(document.model_dump(by_alias=True, exclude_none=True, exclude_unset=True), ())
@@ -163,7 +163,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise SceneError("the file must be TOML, but got brackets nested too deeply; flatten them") from None
 
 
-def _built(document: Document) -> SceneFile:
+def _built(document: Document, folder: Path) -> SceneFile:
     ball = Ball(**dict(document.ball))
     surfaces = {name: _object(table, _SHAPE_CLASSES) for name, table in document.surfaces.items()}
     for name, surface in surfaces.items():
@@ -177,7 +177,8 @@ def _built(document: Document) -> SceneFile:
     _check_outside(scene, document.throw.position)
     throw = _throw(document)
     simulate = _simulate(document, scene)
-    return SceneFile(scene, throw, simulate, _design(document, scene, throw))
+    monte_carlo = None if document.monte_carlo is None else task_of(document.monte_carlo, scene, throw, folder)
+    return SceneFile(scene, throw, simulate, _design(document, scene, throw), monte_carlo)
 
 
 def _object(table: Any, classes: dict[str, Any]) -> Any:
@@ -348,6 +349,8 @@ def _tables(file: SceneFile) -> dict[str, Any]:
         tables["design"]["goal"] = _table(task.goal, _GOAL_CLASSES, GOALS, "kind", "design.goal")
         if task.bounds:
             tables["design"]["bounds"] = {name: _plain(pair) for name, pair in task.bounds.items()}
+    if file.monte_carlo is not None:
+        tables["monte_carlo"] = table_of(file.monte_carlo)
     return tables
 
 
@@ -383,9 +386,16 @@ def _key(name: str) -> str:
 def _emitted(table: dict[str, Any], path: tuple[str, ...]) -> list[str]:
     """TOML lines of a table: its own values first, then its subtables; a table with a `kind` stands in one line."""
     inner = {name: value for name, value in table.items() if isinstance(value, dict) and "kind" not in value}
-    lines = [f"{_key(name)} = {_literal(value)}" for name, value in table.items() if name not in inner]
+    rows = {
+        name: value for name, value in table.items() if isinstance(value, list) and value and isinstance(value[0], dict)
+    }
+    lines = [f"{_key(name)} = {_literal(value)}" for name, value in table.items() if name not in {**inner, **rows}]
     if path and (lines or not inner):
         lines.insert(0, f"\n[{'.'.join(_key(part) for part in path)}]")
     for name, value in inner.items():
         lines += _emitted(value, (*path, name))
+    for name, value in rows.items():
+        for row in value:
+            lines.append(f"\n[[{'.'.join(_key(part) for part in (*path, name))}]]")
+            lines += [f"{_key(field)} = {_literal(entry)}" for field, entry in row.items()]
     return lines

@@ -1,0 +1,230 @@
+"""What is measured of a trajectory in a Monte Carlo study. Any function of a `Trajectory` may be; these are ready."""
+
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ._trajectory import Trajectory
+from ._vector import frozen
+
+_SAMPLES = 17  # of an arc, of which the nearest begins Newton's method
+_NEWTON_STEPS = 3
+
+
+class AbstractMeasure(eqx.Module):
+    """A function of one `Trajectory` that returns a number, a vector of shape (3,), or True or False (an event, whose
+    mean is its probability). NaN where there is nothing to measure. `unit` is that of the numbers."""
+
+    unit: eqx.AbstractClassVar[str]
+
+    @abstractmethod
+    def __call__(self, trajectory: Trajectory) -> Any:
+        """The measured value."""
+
+
+def _point(x: Any) -> Any:
+    point = jnp.asarray(x, dtype=None if isinstance(x, jax.Array) else float)
+    if point.shape != (3,):
+        raise ValueError(f"Argument `point` must have shape (3,), but got {point.shape}; try [0.0, 0.0, 1.0].")
+    return point
+
+
+def _row(trajectory: Trajectory, surface: str | None, count: int) -> tuple[Any, Any]:
+    """The row of the log with that impact on that surface, and whether there is one."""
+    log = trajectory.impacts
+    names = trajectory.system.names
+    if surface is not None and surface not in names:
+        raise ValueError(f"Argument `surface` must be one of {', '.join(names)}, but got {surface!r}.")
+    wanted = log.surface >= 0 if surface is None else log.surface == names.index(surface)
+    there = wanted & (jnp.cumsum(wanted, dtype=jnp.int32) == count)
+    return jnp.argmax(there), jnp.any(there)
+
+
+class Landing(AbstractMeasure):
+    """Contact point, in m, of the impact number `count` on the surface of that name (on any if `None`); shape (3,).
+
+    ```python
+    from nonholo_jax import Landing
+    Landing("floor")                                         # where the ball first comes to the floor
+    ```
+    """
+
+    unit: ClassVar[str] = "m"
+    surface: str | None = eqx.field(static=True, default=None)
+    count: int = eqx.field(static=True, default=1)
+
+    def __call__(self, trajectory) -> Float[Array, "3"]:
+        row, there = _row(trajectory, self.surface, self.count)
+        return jnp.where(there, trajectory.impacts.point[row], jnp.nan)
+
+
+class LandingTime(AbstractMeasure):
+    """Time, in s, of the impact number `count` on the surface of that name (on any if `None`).
+
+    ```python
+    from nonholo_jax import LandingTime
+    LandingTime("table")
+    ```
+    """
+
+    unit: ClassVar[str] = "s"
+    surface: str | None = eqx.field(static=True, default=None)
+    count: int = eqx.field(static=True, default=1)
+
+    def __call__(self, trajectory) -> Float[Array, ""]:
+        row, there = _row(trajectory, self.surface, self.count)
+        return jnp.where(there, trajectory.impacts.time[row], jnp.nan)
+
+
+class ImpactCount(AbstractMeasure):
+    """How many impacts there were; a train is one.
+
+    ```python
+    from nonholo_jax import ImpactCount
+    ImpactCount()
+    ```
+    """
+
+    unit: ClassVar[str] = ""
+
+    def __call__(self, trajectory) -> Float[Array, ""]:
+        return trajectory.n_impacts.astype(trajectory.t1.dtype)
+
+
+class FinalPosition(AbstractMeasure):
+    """Position, in m, at the end; shape (3,).
+
+    ```python
+    from nonholo_jax import FinalPosition
+    FinalPosition()
+    ```
+    """
+
+    unit: ClassVar[str] = "m"
+
+    def __call__(self, trajectory) -> Float[Array, "3"]:
+        return trajectory.final.position
+
+
+class Distance(AbstractMeasure):
+    """How near, in m, the ball's centre comes to `point` (in m, shape (3,)) after impact number `after` (0: from the
+    beginning on). Exact for parabolas; with air on the polynomial of degree five that has the position, velocity and
+    acceleration of both ends of an arc. NaN where there are fewer impacts. Bounces of a train are passed over, and so
+    is what follows the last impact that the log has room for.
+
+    ```python
+    from nonholo_jax import Distance
+    Distance([-0.3, 0.0, 0.9])
+    ```
+    """
+
+    unit: ClassVar[str] = "m"
+    point: Float[Array, "3"] = eqx.field(converter=_point)
+    after: int = eqx.field(static=True, default=1)
+
+    def __call__(self, trajectory) -> Float[Array, ""]:
+        return _nearest(trajectory, self.point, self.after)
+
+
+class Returns(AbstractMeasure):
+    """Whether the ball's centre comes within `within` m of `point` (in m, shape (3,)) after impact number `after`: see
+    `Distance`. Raises `ValueError` unless `within` is positive.
+
+    ```python
+    from nonholo_jax import Returns
+    Returns([-0.3, 0.0, 0.9], within=0.1)                    # back to the hand
+    ```
+    """
+
+    unit: ClassVar[str] = ""
+    point: Float[Array, "3"] = eqx.field(converter=_point)
+    within: float = eqx.field(static=True)
+    after: int = eqx.field(static=True, default=1)
+
+    def __check_init__(self):
+        if not self.within > 0:
+            raise ValueError(f"Argument `within` must be positive, but got {self.within}; try within=0.1 (metres).")
+
+    def __call__(self, trajectory) -> Bool[Array, ""]:
+        return _nearest(trajectory, self.point, self.after) <= self.within
+
+
+def _nearest(trajectory: Trajectory, point: Any, after: int) -> Any:
+    """The smallest distance to a point on the arcs that begin with impact number `after`."""
+    log, dtype = trajectory.impacts, trajectory.t1.dtype
+    rows = log.time.shape[0]
+    point, first = point.astype(dtype), jax.tree.map(lambda x: x[None], trajectory.initial)
+    last = jax.tree.map(lambda x: x[None], trajectory.final)
+    if rows == 0 and after > 0:
+        return jnp.asarray(jnp.nan, dtype)
+    join = lambda *xs: jnp.concatenate([jnp.asarray(x) for x in xs])  # noqa: E731
+    begins, phases = join(trajectory.t0[None], log.until), join(-jnp.ones(1, jnp.int32), log.support)
+    starts = jax.tree.map(join, first, log.after)
+    arc = jnp.arange(rows + 1, dtype=jnp.int32)
+    is_last = arc == trajectory.n_impacts
+    ends = join(log.time, trajectory.t1[None])
+    ends = jnp.where(is_last, trajectory.t1, ends)
+    arrivals = jax.tree.map(
+        lambda x, y: jnp.where(is_last.reshape((-1,) + (1,) * (y.ndim - 1)), y, join(x, y)), log.before, last
+    )
+    there = (arc >= after) & (arc <= trajectory.n_impacts) & (is_last | (arc < rows))
+    if rows == 0:
+        there = there & is_last
+    tame = lambda x, y: jnp.where(there.reshape((-1,) + (1,) * (x.ndim - 1)), x, y)  # noqa: E731
+    harmless = jax.tree.map(lambda x: jnp.broadcast_to(x, (rows + 1, *x.shape[1:])), first)
+    starts, arrivals = (jax.tree.map(tame, x, harmless) for x in (starts, arrivals))
+    begins, ends = jnp.where(there, begins, 0.0), jnp.where(there, ends, 0.0)
+    of_arc = lambda *arc: _on_arc(trajectory.system, point, *arc)  # noqa: E731
+    away = jax.vmap(of_arc)(begins, ends, starts, arrivals, jnp.where(there, phases, -1))
+    found = jnp.min(jnp.where(there, away, jnp.inf))
+    return jnp.where(jnp.isfinite(found), found, jnp.nan)
+
+
+def _on_arc(system: Any, point: Any, begin: Any, end: Any, start: Any, arrival: Any, phase: Any) -> Any:
+    free, h = system.without_contacts(), end - begin
+
+    def pull(time: Any, state: Any) -> Any:
+        inner = free.unpacked(state, phase)
+        _, rate = free.derivative(time, inner, *free.evolving(inner))
+        return jnp.stack([jnp.asarray(x, dtype=h.dtype) for x in rate[:3]])
+
+    x, v, a = start.position - point, h * start.velocity, h * h * pull(begin, start)
+    far = arrival.position - point - (x + v + 0.5 * a)
+    fast, strong = h * arrival.velocity - (v + a), h * h * pull(end, arrival) - a
+    parts = (x, v, 0.5 * a, 10.0 * far - 4.0 * fast + 0.5 * strong, -15.0 * far + 7.0 * fast - strong,
+             6.0 * far - 3.0 * fast + 0.5 * strong)  # fmt: skip
+    return _nearest_of(jnp.stack(parts))
+
+
+def _nearest_of(parts: Any) -> Any:
+    """The smallest length of a polynomial of degree five on [0, 1], of coefficients of shape (6, 3)."""
+    still = frozen(parts)
+    s = jnp.linspace(0.0, 1.0, _SAMPLES, dtype=parts.dtype)
+    at = sum(still[k][None] * (s**k)[:, None] for k in range(6))
+    nearest = jnp.argmin(jnp.sum(at**2, axis=-1))
+    low, high = s[jnp.maximum(nearest - 1, 0)], s[jnp.minimum(nearest + 1, _SAMPLES - 1)]
+    s = s[nearest]
+
+    def derivatives(s: Any) -> tuple[Any, Any, Any]:
+        x, v, a = still[5], jnp.zeros(3, parts.dtype), jnp.zeros(3, parts.dtype)
+        for k in (4, 3, 2, 1, 0):
+            x, v, a = still[k] + s * x, x + s * v, v + s * a
+        return x, v, 2.0 * a
+
+    for _ in range(_NEWTON_STEPS):
+        x, v, a = derivatives(s)
+        speed = jnp.sum(v * v)
+        curvature = speed + jnp.sum(x * a)
+        curvature = jnp.where(curvature > 0, curvature, speed)
+        step = jnp.sum(x * v) / jnp.where(curvature > 0, curvature, 1.0)
+        s = jnp.clip(s - step, low, high)
+    # At the closest point the distance does not depend on s to first order.
+    place = parts[5]
+    for k in (4, 3, 2, 1, 0):
+        place = parts[k] + s * place
+    square = jnp.sum(place * place)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
