@@ -41,6 +41,14 @@ from ._motion_integrated import Integrated as Integrated
 from ._round import Cylinder as Cylinder, Sphere as Sphere
 from ._sampler import Sampler as Sampler, Vary as Vary
 from ._scene import Scene as Scene
+from ._sensitivity import (
+    Expectation as Expectation,
+    Indices as Indices,
+    Propagation as Propagation,
+    expectation as expectation,
+    propagate as propagate,
+    sobol_indices as sobol_indices,
+)
 from ._simulate import SimulationError as SimulationError, simulate as simulate, simulate_batch as simulate_batch
 from ._store import StoreError as StoreError
 from ._surface import (

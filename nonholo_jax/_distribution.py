@@ -43,6 +43,8 @@ def _finite(name: str, x: Any) -> Any:
 
 
 def _shown(x: Any) -> str:
+    if not _known(x):
+        return "a traced array"
     values = np.asarray(x).tolist()
     return str(values[0] if len(values) == 1 else values)
 
@@ -62,6 +64,10 @@ class AbstractDistribution(eqx.Module):
     def values(self, u: Float[Array, " k"], center: Float[Array, " n"]) -> Float[Array, " n"]:
         """The values of one throw."""
 
+    @abstractmethod
+    def moments(self, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean, shape (n,), and covariance, shape (n, n)."""
+
     def check(self, n: int) -> None:
         """Raises `ValueError` where it does not fit `n` numbers."""
 
@@ -76,6 +82,15 @@ def _fits(n: int, **rows: Any) -> None:
 
 def _center(given: Any, center: Any) -> Any:
     return center if given is None else given.astype(center.dtype)
+
+
+def _mean(given: Any, center: np.ndarray) -> np.ndarray:
+    return center if given is None else np.broadcast_to(np.asarray(given), center.shape)
+
+
+def _moments(mean: np.ndarray, variance: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Of independent numbers."""
+    return mean, np.diag(np.broadcast_to(variance, mean.shape))
 
 
 class Normal(AbstractDistribution):
@@ -100,6 +115,9 @@ class Normal(AbstractDistribution):
 
     def values(self, u, center):
         return _center(self.mean, center) + self.std.astype(u.dtype) * ndtri(u)
+
+    def moments(self, center):
+        return _moments(_mean(self.mean, center), np.asarray(self.std) ** 2)
 
     def check(self, n):
         _fits(n, std=self.std, mean=self.mean)
@@ -129,6 +147,10 @@ class Uniform(AbstractDistribution):
         low, high = self.low.astype(u.dtype), self.high.astype(u.dtype)
         return low + (high - low) * u
 
+    def moments(self, center):
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        return _moments(np.broadcast_to(0.5 * (low + high), center.shape), (high - low) ** 2 / 12.0)
+
     def check(self, n):
         _fits(n, low=self.low, high=self.high)
 
@@ -157,6 +179,11 @@ class LogNormal(AbstractDistribution):
 
     def values(self, u, center):
         return _center(self.median, center) * jnp.exp(self.sigma.astype(u.dtype) * ndtri(u))
+
+    def moments(self, center):
+        median, square = _mean(self.median, center), np.asarray(self.sigma) ** 2
+        mean = median * np.exp(0.5 * square)
+        return _moments(mean, mean**2 * np.expm1(square))
 
     def check(self, n):
         _fits(n, sigma=self.sigma, median=self.median)
@@ -197,6 +224,14 @@ class TruncatedNormal(AbstractDistribution):
         part = jnp.where(flip, 1.0 - u, u)
         z = ndtri(ndtr(a) + part * (ndtr(b) - ndtr(a)))
         return jnp.clip(mean + std * jnp.where(flip, -z, z), self.low.astype(u.dtype), self.high.astype(u.dtype))
+
+    def moments(self, center):
+        from scipy.stats import truncnorm
+
+        mean, std = _mean(self.mean, center), np.asarray(self.std)
+        ends = [(np.asarray(x) - mean) / std for x in (self.low, self.high)]
+        first, second = truncnorm.stats(*ends, loc=mean, scale=std, moments="mv")
+        return _moments(np.asarray(first), np.asarray(second))
 
     def check(self, n):
         _fits(n, std=self.std, low=self.low, high=self.high, mean=self.mean)
@@ -242,6 +277,10 @@ class Correlated(AbstractDistribution):
         turned = sum(root[:, i] * z[i] for i in range(root.shape[1]))
         return _center(self.mean, center) + turned
 
+    def moments(self, center):
+        root = np.asarray(self.root)
+        return _mean(self.mean, center), root @ root.T
+
     def check(self, n):
         if self.root.shape[0] != n:
             raise ValueError(f"Argument `covariance` must have {n} rows, one for each name, but got {len(self.root)}.")
@@ -280,6 +319,10 @@ class Measured(AbstractDistribution):
         last = self.rows.shape[0] - 1
         index = jnp.minimum((u[0] * self.rows.shape[0]).astype(jnp.int32), last)
         return self.rows.astype(u.dtype)[index]
+
+    def moments(self, center):
+        rows = np.asarray(self.rows)
+        return rows.mean(axis=0), np.atleast_2d(np.cov(rows.T, ddof=0))
 
     def check(self, n):
         if self.rows.shape[1] != n:

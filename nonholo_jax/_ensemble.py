@@ -7,19 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ._measure import Quantity
 from ._scene import Scene
 from ._statistics import N_BINS, Estimate, Frame, Sums, means, probability, quantiles
 from ._types import NAMES_OF_RESULTS
 
 LEVELS = (0.001, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.975, 0.99, 0.999)
-
-
-class Quantity(NamedTuple):
-    """A number that was measured; an `event` is true or false, and its mean a probability."""
-
-    name: str
-    unit: str
-    event: bool
 
 
 class Frequency(NamedTuple):

@@ -119,9 +119,10 @@ def _distribution(ax: Axes, found: Ensemble, name: str) -> None:
     ax.axvline(middle, color=_INK, lw=0.9)
     for level in (0.05, 0.95):
         ax.axvline(found.quantile(name, level)[0], color=_INK, lw=0.7, ls=(0, (3, 3)))
-    note = f"present in {present / found.n:.1%}" + (f", {outside} outside" if outside else "")
+    note = "" if present == found.n else f"; present in {present / found.n:.4g}"
+    note += f"; {outside} outside" if outside else ""
     ax.set_title(f"{name}: median and 90 % of {'those there' if present < found.n else 'all'}", fontsize=9, loc="left")
-    ax.set_xlabel(f"{_label(found, name)}; {note}", fontsize=8)
+    ax.set_xlabel(f"{_label(found, name)}{note}", fontsize=8)
     ax.set_ylabel("density", fontsize=8)
     ax.set_ylim(bottom=0)
 
@@ -159,7 +160,7 @@ def _convergence(ax: Axes, found: Ensemble, name: str) -> None:
     ax.fill_between(n, mean - 1.96 * error, mean + 1.96 * error, color=_BAND, lw=0)
     ax.plot(n, mean, color=_BAR, lw=1.2, marker="." if len(n) < 12 else None)
     ax.axhline(mean[-1], color=_FAINT, lw=0.7, ls=(0, (3, 3)))
-    if len(n) > 1:
+    if n[-1] > 10 * n[0]:
         ax.set_xscale("log")
     what = "probability" if found.quantities[i].event else "mean"
     ax.set_title(f"{what} of {name}, with its 95 % band", fontsize=9, loc="left")

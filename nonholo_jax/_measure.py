@@ -1,7 +1,8 @@
 """What is measured of a trajectory in a Monte Carlo study. Any function of a `Trajectory` may be; these are ready."""
 
 from abc import abstractmethod
-from typing import Any, ClassVar
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,6 +25,39 @@ class AbstractMeasure(eqx.Module):
     @abstractmethod
     def __call__(self, trajectory: Trajectory) -> Any:
         """The measured value."""
+
+
+class Quantity(NamedTuple):
+    """A number that was measured; an `event` is true or false, and its mean a probability."""
+
+    name: str
+    unit: str
+    event: bool
+
+
+def quantities_of(measures: Mapping[str, Any], shapes: Sequence[Any]) -> tuple[list[Quantity], tuple]:
+    """The numbers that measures of such shapes give, and pairs of them that are places seen from above."""
+    found: list[Quantity] = []
+    pairs = []
+    for (name, measure), shape in zip(measures.items(), shapes, strict=True):
+        unit, event = getattr(measure, "unit", ""), shape.dtype == bool
+        if len(shape.shape) > 1:
+            raise ValueError(f"Measure {name!r} must give a number or a vector, but gives shape {shape.shape}.")
+        if shape.shape == ():
+            found.append(Quantity(name, unit, event))
+            continue
+        if shape.shape == (3,) and unit == "m":
+            pairs.append((len(found), len(found) + 1))
+        letters = ("x", "y", "z") if shape.shape[0] == 3 else tuple(map(str, range(shape.shape[0])))
+        found += [Quantity(f"{name}.{letter}", unit, event) for letter in letters]
+    return found, tuple(pairs)
+
+
+def flat(measures: Iterable[Any], trajectory: Trajectory) -> Float[Array, " q"]:
+    """All that is measured of one trajectory."""
+    dtype = trajectory.t1.dtype
+    parts = [jnp.ravel(jnp.asarray(measure(trajectory)).astype(dtype)) for measure in measures]
+    return jnp.concatenate(parts) if parts else jnp.zeros((0,), dtype)
 
 
 def _point(x: Any) -> Any:

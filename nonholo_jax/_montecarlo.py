@@ -1,5 +1,6 @@
 """Batch Monte Carlo: throws drawn, run and measured chunk by chunk, in memory that does not grow with their number."""
 
+import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
@@ -13,22 +14,21 @@ import numpy as np
 from tqdm import tqdm
 
 from ._ball import BallState
-from ._ensemble import Ensemble, Quantity
-from ._measure import AbstractMeasure, ImpactCount
+from ._ensemble import Ensemble
+from ._measure import AbstractMeasure, ImpactCount, flat, quantities_of
 from ._motion import AbstractMotion
-from ._sampler import SOBOL_MOST, Sampler, halves, sobol, uniforms
+from ._sampler import SOBOL_MOST, Sampler, halves, uniforms
 from ._scene import Scene
 from ._simulate import checked, simulate
 from ._statistics import Frame, Sums, Totals, frame_of, means, sums_of
 from ._store import Store
 from ._tiles import by_tiles, over_devices
-from ._types import NAMES_OF_RESULTS
+from ._types import KINDS, NAMES_OF_RESULTS, NO_IMPACTS
 
 _PILOT = 1024  # throws that choose the edges of histograms
-_CHUNK = 16_384
+_CHUNKS, _CHUNK = 32, (1024, 16_384)  # at least so many, of sizes between
 _POLL = 0.2  # s
 _STATE = tuple(f"throw.{name}.{c}" for name in ("position", "velocity", "spin") for c in "xyz")
-_COMPONENTS = {3: ("x", "y", "z")}
 
 
 class _Plan(NamedTuple):
@@ -86,7 +86,7 @@ def monte_carlo(
         Itineraries and results are always counted. Default: the number of impacts.
     - `itinerary_length`: how many impacts of an itinerary count, and how many rows of the log a measure sees.
     - `t1`, `t0`, `max_impacts`, `motion`, `accuracy`, `sum_trains`: as in `simulate`.
-    - `chunk`: throws that are in memory at once (default: 16,384).
+    - `chunk`: throws that are in memory at once (default: between 1,024 and 16,384, so that there are some 32 chunks).
     - `seconds`, `standard_error` (by name of a quantity, the one that is wanted): stop earlier, after a whole chunk.
     - `out`: folder that keeps every chunk as soon as it is done; `resume=True` goes on where a run of the same study
         stopped, to the identical result. Several processes (`jax.distributed`) share the chunks of one folder.
@@ -106,14 +106,13 @@ def monte_carlo(
     print(found.mean("landing.x"), found.standard_error("landing.x"), found.itineraries[0])
     ```
     """
-    _check_counts(n=n, itinerary_length=itinerary_length, chunk=_CHUNK if chunk is None else chunk)
+    _check_counts(n=n, itinerary_length=itinerary_length, chunk=1 if chunk is None else chunk)
+    chunk = min(max(-(-n // (_CHUNKS * _CHUNK[0])) * _CHUNK[0], _CHUNK[0]), _CHUNK[1]) if chunk is None else chunk
     key = jax.random.key(key) if isinstance(key, int) else key
     wanted = None if accuracy is None else (accuracy, getattr(sampler, "throw", None), t0, t1)
     motion, log_rows = checked(scene, motion, max_impacts, min(itinerary_length, max_impacts), sum_trains, wanted)
     measures = {"impacts": ImpactCount()} if measures is None else dict(measures)
-    study = _Study(
-        scene, sampler, key, t0, t1, motion, measures, (max_impacts, log_rows, sum_trains), n, chunk or _CHUNK
-    )
+    study = _Study(scene, sampler, key, t0, t1, motion, measures, (max_impacts, log_rows, sum_trains), n, chunk)
     study.check_names(standard_error, records, record_where)
     run = study.description(records, record_where)
     store = None if out is None else Store(out, run)
@@ -147,31 +146,13 @@ class _Study:
             raise ValueError(
                 f"Argument `t1` must be finite and at least `t0`, but got t1={t1} and t0={t0}; try t1=1.0."
             )
-        if self.is_table and sampler.sequence == "sobol" and n > SOBOL_MOST:
-            what = f"must be at most {SOBOL_MOST} with the Sobol sequence, but got {n}"
+        if self.is_table and sampler.sequence != "random" and n > SOBOL_MOST:
+            what = f"must be at most {SOBOL_MOST} with a Sobol sequence, but got {n}"
             raise ValueError(f"Argument `n` {what}; try sequence='random'.")
         self.devices = len(jax.local_devices())
         function = None if self.is_table else sampler
         self.plan = _Plan(function, tuple(measures.values()), how[0], how[1], how[2], self.devices)
-        self.quantities, self.pairs = self._quantities()
-
-    def _quantities(self) -> tuple[list[Quantity], tuple]:
-        """The numbers that are measured, and pairs of them that are places seen from above."""
-        found: list[Quantity] = []
-        pairs = []
-        shapes = jax.eval_shape(lambda: self._measured_once())
-        for (name, measure), shape in zip(self.measures.items(), shapes, strict=True):
-            unit, event = getattr(measure, "unit", ""), shape.dtype == bool
-            if len(shape.shape) > 1:
-                raise ValueError(f"Measure {name!r} must give a number or a vector, but gives shape {shape.shape}.")
-            if shape.shape == ():
-                found.append(Quantity(name, unit, event))
-                continue
-            if shape.shape == (3,) and unit == "m":
-                pairs.append((len(found), len(found) + 1))
-            letters = _COMPONENTS.get(shape.shape[0], tuple(map(str, range(shape.shape[0]))))
-            found += [Quantity(f"{name}.{letter}", unit, event) for letter in letters]
-        return found, tuple(pairs)
+        self.quantities, self.pairs = quantities_of(measures, jax.eval_shape(lambda: self._measured_once()))
 
     def _measured_once(self) -> list:
         u = jnp.full(self.sampler.n_uniform(self.scene), 0.5, self.dtype) if self.is_table else None
@@ -216,6 +197,8 @@ class _Study:
             "dtype": str(self.dtype),
             "how": list(self.plan[2:5]),
             "inputs": list(self.inputs),
+            "sequence": self.sampler.sequence if self.is_table else "random",
+            "sources": list(self.sampler.sources(self.scene)) if self.is_table else [],
             "surfaces": list(self.scene.names),
             "quantities": [list(each) for each in self.quantities],
             "records": None if records is None else "all" if records == "all" else _as_list(records),
@@ -228,9 +211,9 @@ class _Study:
         tile = self.motion.tile * self.devices
         padded = -(-max(self.chunk, count) // tile) * tile
         index = start + np.minimum(np.arange(padded, dtype=np.int64), count - 1)
-        if self.is_table and self.sampler.sequence == "sobol":
+        if self.is_table and self.sampler.sequence != "random":
             seed = np.asarray(jax.random.key_data(self.key)).ravel().tolist()
-            u = sobol(seed, self.sampler.n_uniform(self.scene), start, count, self.dtype)
+            u = self.sampler.chosen(self.scene, seed, start, count)
             lanes: Any = np.concatenate([u, np.repeat(u[-1:], padded - count, axis=0)])
         else:
             lanes = halves(index)
@@ -289,10 +272,12 @@ def _run_chunk(plan: _Plan, scene, sampler, key, motion, t0, t1, lanes) -> _Foun
                 u = uniforms(key, lane, (sampler.n_uniform(scene),), sampler.throw.position.dtype)
             inputs, room, state = _drawn(scene, sampler, key, u)
         trajectory = simulate(room, state, t0=t0, t1=t1, motion=motion, throw=False, **options)
-        measured = [jnp.ravel(jnp.asarray(m(trajectory)).astype(t1.dtype)) for m in plan.measures]
-        values = jnp.concatenate(measured) if measured else jnp.zeros((0,), t1.dtype)
+        values = flat(plan.measures, trajectory)
         code = jnp.asarray(trajectory.result._value, dtype=jnp.int32)
-        return _Found(inputs, values, trajectory.impacts.surface.astype(jnp.int16), code)
+        log = trajectory.impacts
+        others = functools.reduce(jnp.logical_or, [log.kind == getattr(KINDS, name) for name in NO_IMPACTS])
+        hits = jnp.where(others, -1, log.surface).astype(jnp.int16)
+        return _Found(inputs, values, hits, code)
 
     arrays, constants = eqx.partition((scene, sampler, key, motion, t0, t1), eqx.is_array)
 

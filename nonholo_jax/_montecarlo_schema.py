@@ -118,7 +118,7 @@ class MonteCarloTable(Table):
     measure: list[MeasureTable] = []
     n: Annotated[int, Field(ge=1, le=10**15)] = 100_000
     seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 0
-    sequence: Literal["random", "sobol"] = "random"
+    sequence: Literal["random", "sobol", "saltelli"] = "random"
     itinerary_length: Annotated[int, Field(ge=0, le=10_000)] = 8
 
     @model_validator(mode="after")

@@ -14,7 +14,7 @@ _ITINERARIES = 8
 def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-n", "--throws", type=int, help="how many throws (default: `n` of the file)")
     parser.add_argument("--seed", type=int, help="of the throws (default: `seed` of the file)")
-    parser.add_argument("--chunk", type=int, help="throws in memory at once (default: 16384)")
+    parser.add_argument("--chunk", type=int, help="throws in memory at once (default: 1024 to 16384)")
     parser.add_argument("--resume", action="store_true", help="go on with the study in the folder")
     parser.add_argument("--seconds", type=float, help="stop after the chunk that is under way then")
     stop = "stop once the standard error of a quantity is as small; may be repeated"

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._ball import BallState
-from ._distribution import AbstractDistribution
+from ._distribution import AbstractDistribution, Correlated
 from ._names import expand, read, write
 from ._scene import Scene
 
-Sequences = Literal["random", "sobol"]
+Sequences = Literal["random", "sobol", "saltelli"]
 SOBOL_MOST = 2**30  # points of a sequence
 
 
@@ -50,7 +50,7 @@ class Sampler(eqx.Module):
     - `vary`: a sequence of `Vary`. Different ones are independent of each other.
     - `sequence`: `"random"`, or `"sobol"` for a scrambled Sobol sequence (`scipy.stats.qmc`), whose means converge
         faster where few numbers vary. Its throws are not independent: standard errors are then those that as many
-        random throws would have.
+        random throws would have. `"saltelli"` is the design that `sobol_indices` takes for its total indices.
 
     `monte_carlo` raises `ValueError` for names that the scene does not have or that come twice, and for distributions
     that do not fit their names.
@@ -70,7 +70,8 @@ class Sampler(eqx.Module):
     def __init__(self, throw: BallState, vary: Sequence[Vary], sequence: Sequences = "random"):
         self.throw, self.vary, self.sequence = throw, tuple(vary), sequence
         if sequence not in get_args(Sequences):
-            raise ValueError(f"Argument `sequence` must be 'random' or 'sobol', but got {sequence!r}; try 'random'.")
+            known = ", ".join(map(repr, get_args(Sequences)))
+            raise ValueError(f"Argument `sequence` must be one of {known}, but got {sequence!r}; try 'random'.")
         if not self.vary:
             raise ValueError(
                 "Argument `vary` must hold at least one Vary, but got none; try Vary('spin', Normal(1.0))."
@@ -102,6 +103,41 @@ class Sampler(eqx.Module):
             found.append(jnp.broadcast_to(new, (len(group),)))
             begin = end
         return jnp.concatenate(found)
+
+    def moments(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        """Mean, shape (d,), and covariance, shape (d, d), of the numbers that vary."""
+        names, found = self.names(scene), []
+        for each, group in self._groups(scene):
+            found.append(each.distribution.moments(np.asarray(read(scene, self.throw, group), dtype=float)))
+        covariance, begin = np.zeros((len(names), len(names))), 0
+        for _, part in found:
+            end = begin + len(part)
+            covariance[begin:end, begin:end] = part
+            begin = end
+        return np.concatenate([mean for mean, _ in found]), covariance
+
+    def sources(self, scene: Scene) -> tuple[str, ...]:
+        """A name for each of the uniform numbers: what it moves."""
+        names: list[str] = []
+        for each, group in self._groups(scene):
+            count = each.distribution.n_uniform(len(group))
+            whole = "+".join(each.names)
+            own = isinstance(each.distribution, Correlated) or count != len(group)
+            names += [f"{whole}#{k}" if count > 1 else whole for k in range(count)] if own else group
+        return tuple(names)
+
+    def chosen(self, scene: Scene, seed: Any, start: int, count: int) -> np.ndarray:
+        """The uniform numbers of throws `start` to `start + count` of a sequence that is not random."""
+        d, dtype = self.n_uniform(scene), self.throw.position.dtype
+        if self.sequence == "sobol":
+            return sobol(seed, d, start, count, dtype)
+        # Saltelli's design: a row A, the same with one number after the other from B, and B.
+        first, last = start // (d + 2), (start + count - 1) // (d + 2)
+        rows = sobol(seed, 2 * d, first, last - first + 1, dtype)
+        index = np.arange(start, start + count)
+        row, place = rows[index // (d + 2) - first], (index % (d + 2))[:, None]
+        from_b = (place == np.arange(1, d + 1)) | (place == d + 1)
+        return np.where(from_b, row[:, d:], row[:, :d])
 
     def applied(self, scene: Scene, values: Float[Array, " d"]) -> tuple[Scene, BallState]:
         """Scene and throw with those numbers."""

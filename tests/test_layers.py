@@ -62,6 +62,7 @@ ORDER = [
     "_store",
     "_ensemble",
     "_montecarlo",
+    "_sensitivity",
     # face
     "_schema_types",
     "_montecarlo_schema",
