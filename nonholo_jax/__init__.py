@@ -22,6 +22,7 @@ from ._distribution import (
     Uniform as Uniform,
 )
 from ._ensemble import Ensemble as Ensemble
+from ._fit import Fit as Fit, Preference as Preference, compare as compare, fit as fit
 from ._goal import AbstractGoal as AbstractGoal, HitTarget as HitTarget, Land as Land, ReturnTo as ReturnTo
 from ._impact import collide as collide, projector as projector
 from ._lagrangian import Barrier as Barrier, LagrangianSystem as LagrangianSystem

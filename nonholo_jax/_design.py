@@ -12,6 +12,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from ._ball import BallState
+from ._chart import Chart, chart_of, limits_of
 from ._goal import AbstractGoal
 from ._names import expand, read, write
 from ._scene import Scene
@@ -141,7 +142,7 @@ def design(
     times = (jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
     problem = _Problem(scene, state, goal, *times, names, _wanted(scene, itinerary), *how)
     first = read(scene, state, names)
-    chart = _chart(scene, state, names, first, _limits(scene, state, names, bounds or {}, dtype))
+    chart = chart_of(scene, state, names, first, limits_of(scene, state, names, bounds or {}, dtype))
     initial = _starts(problem, chart, first, n_starts, jax.random.key(0) if key is None else key)
     descent = _descend(problem, chart, initial, _least_squares_solver(solver), max_steps)
     begun, found, (miss, met, hit, result, time), steps = descent
@@ -223,7 +224,7 @@ class _Problem(eqx.Module):
             met = met & (trajectory.n_impacts >= self.goal.passes_after)
         return self._judged(residual, met, trajectory, time)
 
-    def at(self, u: Any, chart: "_Chart") -> tuple[Any, tuple]:
+    def at(self, u: Any, chart: Chart) -> tuple[Any, tuple]:
         """The residual at a point of the chart. The solver works in JAX's default precision, the motion in its own."""
         wide, u = u.dtype, u.astype(self.t1.dtype)
         if self.timed:
@@ -244,57 +245,6 @@ class _Problem(eqx.Module):
         if self.wanted is None:
             return trajectory.n_impacts >= 0
         return jnp.all(trajectory.impacts.surface == jnp.asarray(self.wanted, dtype=jnp.int32))
-
-
-class _Chart(eqx.Module):
-    """Free numbers from coordinates without bounds, all of order one (the transformations of MINUIT)."""
-
-    centre: Array
-    scale: Array
-    low: Array
-    high: Array
-
-    def value(self, u: Any) -> Any:
-        below, above = jnp.isfinite(self.low), jnp.isfinite(self.high)
-        low, high = jnp.where(below, self.low, 0.0), jnp.where(above, self.high, 0.0)
-        rise = self.scale * (jnp.sqrt(u * u + 1.0) - 1.0)
-        one_sided = jnp.where(below, low + rise, high - rise)
-        two_sided = low + 0.5 * (high - low) * (1.0 + jnp.sin(u))
-        return jnp.where(below & above, two_sided, jnp.where(below | above, one_sided, self.centre + self.scale * u))
-
-    def coordinate(self, x: Any) -> Any:
-        below, above = jnp.isfinite(self.low), jnp.isfinite(self.high)
-        low, high = jnp.where(below, self.low, 0.0), jnp.where(above, self.high, 1.0)
-        rise = jnp.maximum(jnp.where(below, x - low, high - x), 0.0) / self.scale + 1.0
-        one_sided = jnp.sqrt(rise * rise - 1.0)
-        width = jnp.where(high > low, high - low, 1.0)
-        two_sided = jnp.arcsin(jnp.clip(2.0 * (x - low) / width - 1.0, -0.999999, 0.999999))
-        return jnp.where(below & above, two_sided, jnp.where(below | above, one_sided, (x - self.centre) / self.scale))
-
-
-def _limits(scene, state, names, bounds: Mapping[str, Sequence[float | int]], dtype) -> tuple[Array, Array]:
-    low, high = [-jnp.inf] * len(names), [jnp.inf] * len(names)
-    for name, pair in bounds.items():
-        for full in expand(scene, state, [name]):
-            if full not in names:
-                raise ValueError(
-                    f"Argument `bounds` must name free numbers, but got {name!r}; try adding it to `free`."
-                )
-            if len(pair) != 2 or not pair[0] < pair[1]:
-                raise ValueError(
-                    f"Argument `bounds[{name!r}]` must be (lowest, highest), but got {pair}; try exchanging."
-                )
-            low[names.index(full)], high[names.index(full)] = pair
-    return jnp.asarray(low, dtype=dtype), jnp.asarray(high, dtype=dtype)
-
-
-def _chart(scene, state, names, first: Any, limits: tuple) -> _Chart:
-    """Coordinates in which one is a natural step: a rolling spin for spins, the speed for velocities."""
-    speed = float(np.linalg.norm(np.asarray(state.velocity))) or 1.0
-    natural = {"throw.velocity": speed, "throw.spin": speed / float(scene.ball.radius), "throw.position": 1.0}
-    sizes = [natural.get(name.rsplit(".", 1)[0], abs(float(x)) or 1.0) for name, x in zip(names, first, strict=True)]
-    low, high = limits
-    return _Chart(first, jnp.asarray(sizes, dtype=first.dtype), low, high)
 
 
 def _checked_names(scene, state, free, itinerary, goal, n_starts: int) -> tuple[str, ...]:
@@ -337,7 +287,7 @@ def _least_squares_solver(solver: Any) -> Any:
 
 
 @eqx.filter_jit
-def _starts(problem: _Problem, chart: _Chart, first: Any, n_starts: int, key: Any) -> Any:
+def _starts(problem: _Problem, chart: Chart, first: Any, n_starts: int, key: Any) -> Any:
     """The first guess and the best of many random candidates, in coordinates."""
     shape = (n_starts * _CANDIDATES_PER_START - 1, first.size)
     bounded = jnp.isfinite(chart.low) & jnp.isfinite(chart.high)
@@ -351,12 +301,12 @@ def _starts(problem: _Problem, chart: _Chart, first: Any, n_starts: int, key: An
 
 
 @eqx.filter_custom_jvp
-def _residual(u: Any, *, problem: _Problem, chart: _Chart) -> tuple[Any, tuple]:
+def _residual(u: Any, *, problem: _Problem, chart: Chart) -> tuple[Any, tuple]:
     return problem.at(u, chart)
 
 
 @_residual.def_jvp
-def _residual_jvp(primals, tangents, *, problem: _Problem, chart: _Chart):
+def _residual_jvp(primals, tangents, *, problem: _Problem, chart: Chart):
     """The whole Jacobian in one forward pass, and its product with the tangent. A solver that linearizes the residual
     then compiles this one program, instead of a value, its linearization and what reverse mode would want to keep."""
     (u,), (du,) = primals, tangents
@@ -365,13 +315,13 @@ def _residual_jvp(primals, tangents, *, problem: _Problem, chart: _Chart):
     return (value, aside), (columns @ du, jax.tree.map(lambda _: None, aside))
 
 
-def _loss(u: Any, problem: _Problem, chart: _Chart) -> tuple[Any, tuple]:
+def _loss(u: Any, problem: _Problem, chart: Chart) -> tuple[Any, tuple]:
     residual, aside = _residual(u, problem=problem, chart=chart)
     return 0.5 * jnp.sum(residual**2), aside
 
 
 @eqx.filter_jit
-def _descend(problem: _Problem, chart: _Chart, initial: Any, solver: Any, max_steps: int) -> tuple:
+def _descend(problem: _Problem, chart: Chart, initial: Any, solver: Any, max_steps: int) -> tuple:
     def one(u):
         options = {"max_steps": max_steps, "throw": False, "has_aux": True}
         if isinstance(solver, optx.AbstractLeastSquaresSolver):
@@ -385,7 +335,7 @@ def _descend(problem: _Problem, chart: _Chart, initial: Any, solver: Any, max_st
     return jax.vmap(one)(initial)
 
 
-def _best(starts: Starts, chart: _Chart, first: Any, tolerance: float) -> int:
+def _best(starts: Starts, chart: Chart, first: Any, tolerance: float) -> int:
     """Of the starts that reached the goal the one nearest to the first guess; else the closest miss. In NumPy, since
     every operation of JAX outside a compiled function is a program of its own to compile."""
     miss, found = np.asarray(starts.miss), np.asarray(starts.found)

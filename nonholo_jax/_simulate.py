@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 
 from ._accuracy import motion_for
 from ._floors import slides_across
@@ -266,7 +267,8 @@ def _check_times(t0: Any, t1: Any) -> None:
         raise ValueError(
             f"Arguments `t0` and `t1` must be scalars, but got shapes {t0.shape} and {t1.shape}; try vmap for several."
         )
-    if not any(isinstance(t, jax.core.Tracer) for t in (t0, t1)) and not t1 >= t0:
+    # By NumPy: within a transformation JAX would trace the comparison of two known numbers.
+    if not any(isinstance(t, jax.core.Tracer) for t in (t0, t1)) and not np.asarray(t1) >= np.asarray(t0):
         raise ValueError(f"Argument `t1` must be finite and at least `t0`, but got t1={t1} and t0={t0}; try t1=1.0.")
 
 

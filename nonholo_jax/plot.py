@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ._ensemble_plot import plot_ensemble as plot_ensemble
+from ._fit_plot import plot_fits as plot_fits
 from ._outline import View, as_numpy, axis_name, half_plane, room, views
 from ._samples import Samples, Strikes, end_of, energies, sample
 from ._scene import Scene
