@@ -119,7 +119,7 @@ def _distribution(ax: Axes, found: Ensemble, name: str) -> None:
     ax.axvline(middle, color=_INK, lw=0.9)
     for level in (0.05, 0.95):
         ax.axvline(found.quantile(name, level)[0], color=_INK, lw=0.7, ls=(0, (3, 3)))
-    note = "" if present == found.n else f"; present in {present / found.n:.4g}"
+    note = "" if present == found.n else f"; absent in {found.n - present}"
     note += f"; {outside} outside" if outside else ""
     ax.set_title(f"{name}: median and 90 % of {'those there' if present < found.n else 'all'}", fontsize=9, loc="left")
     ax.set_xlabel(f"{_label(found, name)}{note}", fontsize=8)
