@@ -2,6 +2,7 @@
 
 import functools
 import time
+import types
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -109,7 +110,10 @@ def monte_carlo(
     _check_counts(n=n, itinerary_length=itinerary_length, chunk=1 if chunk is None else chunk)
     chunk = min(max(-(-n // (_CHUNKS * _CHUNK[0])) * _CHUNK[0], _CHUNK[0]), _CHUNK[1]) if chunk is None else chunk
     key = jax.random.key(key) if isinstance(key, int) else key
-    wanted = None if accuracy is None else (accuracy, getattr(sampler, "throw", None), t0, t1)
+    if accuracy is not None and not isinstance(sampler, Sampler):
+        what = f"must come with a Sampler, whose throw it is for, but got {type(sampler).__name__}"
+        raise ValueError(f"Argument `accuracy` {what}; try motion=Integrated(rtol=1e-8).")
+    wanted = None if accuracy is None else (accuracy, sampler.throw, t0, t1)
     motion, log_rows = checked(scene, motion, max_impacts, min(itinerary_length, max_impacts), sum_trains, wanted)
     measures = {"impacts": ImpactCount()} if measures is None else dict(measures)
     study = _Study(scene, sampler, key, t0, t1, motion, measures, (max_impacts, log_rows, sum_trains), n, chunk)
@@ -238,7 +242,15 @@ def _spelled(thing: Any) -> str:
         return f"{type(thing).__name__} {eqx.tree_pformat(thing, short_arrays=True)} {numbers} {_static(treedef)}"
     code = getattr(thing, "__code__", None)
     name = f"{getattr(thing, '__module__', '')}.{getattr(thing, '__qualname__', type(thing).__name__)}"
-    return name if code is None else f"{name} {code.co_code.hex()} {code.co_names}"
+    if code is None:
+        return f"{name} {_static(repr(thing))}"
+    cells = [_spelled(cell.cell_contents) for cell in thing.__closure__ or ()]
+    return f"{name} {_code(code)} {cells}"
+
+
+def _code(code: types.CodeType) -> str:
+    constants = [_code(x) if isinstance(x, types.CodeType) else repr(x) for x in code.co_consts]
+    return f"{code.co_code.hex()} {code.co_names} {constants}"
 
 
 def _static(treedef: Any) -> str:

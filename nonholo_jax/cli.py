@@ -168,7 +168,8 @@ def _choose_for_xla(verb: str) -> None:
     not know that flag, and XLA stops at a flag that it does not know. What is chosen already stays."""
     flags = {"--xla_cpu_use_fusion_emitters=": "false"} if metadata.version("jaxlib").startswith("0.10.") else {}
     if verb == "montecarlo":
-        flags["--xla_force_host_platform_device_count="] = str(len(os.sched_getaffinity(0)))
+        own = getattr(os, "sched_getaffinity", None)  # the cores that this process may use, where the system says so
+        flags["--xla_force_host_platform_device_count="] = str(len(own(0)) if own else os.cpu_count() or 1)
     chosen = os.environ.get("XLA_FLAGS", "")
     more = [flag + value for flag, value in flags.items() if flag not in chosen]
     if more:

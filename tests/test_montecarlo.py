@@ -42,6 +42,7 @@ from nonholo_jax import (
     monte_carlo,
     simulate,
 )
+from nonholo_jax._montecarlo import _spelled
 
 G, T1 = 9.81, 1.2
 FLOOR = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Rough(0.8))
@@ -271,6 +272,16 @@ def test_a_folder_of_something_else_is_refused(kept, tmp_path):
         Ensemble.open(tmp_path)
 
 
+def test_what_determines_a_study_is_told_apart():
+    """Functions by their code, the constants in it and what it closes over; the same again from run to run."""
+    times = lambda x: lambda trajectory: x * trajectory.t1  # noqa: E731
+    twice, thrice = (lambda trajectory: 2.0 * trajectory.t1), (lambda trajectory: 3.0 * trajectory.t1)
+    assert _spelled(twice) != _spelled(thrice)
+    assert _spelled(times(2.0)) == _spelled(times(2.0)) != _spelled(times(3.0))
+    assert _spelled(Landing("floor")) == _spelled(Landing("floor")) != _spelled(Landing("wall"))
+    assert _spelled(SAMPLER) != _spelled(Sampler(THROW, [Vary("velocity", Normal(0.1))]))
+
+
 @pytest.mark.parametrize("part", ["chunks/00000001.npz", "frame.npz", "run.json"])
 def test_damage_is_found(kept, tmp_path, part):
     folder = tmp_path / "study"
@@ -310,6 +321,7 @@ WRONG = {
     "records": (lambda: study(records="all"), "`out`"),
     "surface": (lambda: study(measures={"there": Landing("roof")}), "roof"),
     "within": (lambda: Returns([0.0, 0.0, 0.0], within=0.0), "positive"),
+    "accuracy": (lambda: monte_carlo(SCENE, lambda key: THROW, n=1, key=0, t1=1.0, accuracy=1e-6), "`accuracy`"),
     "times": (lambda: study(t1=-1.0), "`t1`"),
     "nothing varies": (lambda: Sampler(THROW, []), "at least one"),
 }
