@@ -19,7 +19,7 @@ _ROUNDS = 3
 _NEWTON_STEPS = 4
 
 
-def _point(x: Any) -> Any:
+def as_point(x: Any) -> Any:
     point = jnp.asarray(x, dtype=None if isinstance(x, jax.Array) else float)
     if point.shape != (3,):
         raise ValueError(f"Argument `point` must have shape (3,), but got {point.shape}; try [0.0, 0.0, 1.0].")
@@ -53,7 +53,7 @@ class ReturnTo(AbstractGoal):
     """
 
     passes_after: ClassVar[int | None] = 1
-    point: Float[Array, "3"] = eqx.field(converter=_point)
+    point: Float[Array, "3"] = eqx.field(converter=as_point)
 
     def residual(self, trajectory, n_required):
         return _closest_approach(trajectory, self.point, 1 if n_required is None else n_required, n_required is None)
@@ -70,7 +70,7 @@ class HitTarget(AbstractGoal):
     """
 
     passes_after: ClassVar[int | None] = 0
-    point: Float[Array, "3"] = eqx.field(converter=_point)
+    point: Float[Array, "3"] = eqx.field(converter=as_point)
 
     def residual(self, trajectory, n_required):
         return _closest_approach(trajectory, self.point, n_required or 0, n_required is None)
@@ -88,7 +88,7 @@ class Land(AbstractGoal):
     """
 
     passes_after: ClassVar[int | None] = None
-    point: Float[Array, "3"] = eqx.field(converter=_point)
+    point: Float[Array, "3"] = eqx.field(converter=as_point)
     surface: str | None = eqx.field(static=True, default=None)
 
     def residual(self, trajectory, n_required):

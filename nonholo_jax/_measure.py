@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ._goal import as_point
 from ._trajectory import Trajectory
 from ._vector import frozen
 
@@ -58,13 +59,6 @@ def flat(measures: Iterable[Any], trajectory: Trajectory) -> Float[Array, " q"]:
     dtype = trajectory.t1.dtype
     parts = [jnp.ravel(jnp.asarray(measure(trajectory)).astype(dtype)) for measure in measures]
     return jnp.concatenate(parts) if parts else jnp.zeros((0,), dtype)
-
-
-def _point(x: Any) -> Any:
-    point = jnp.asarray(x, dtype=None if isinstance(x, jax.Array) else float)
-    if point.shape != (3,):
-        raise ValueError(f"Argument `point` must have shape (3,), but got {point.shape}; try [0.0, 0.0, 1.0].")
-    return point
 
 
 def _row(trajectory: Trajectory, surface: str | None, count: int) -> tuple[Any, Any]:
@@ -157,7 +151,7 @@ class Distance(AbstractMeasure):
     """
 
     unit: ClassVar[str] = "m"
-    point: Float[Array, "3"] = eqx.field(converter=_point)
+    point: Float[Array, "3"] = eqx.field(converter=as_point)
     after: int = eqx.field(static=True, default=1)
 
     def __call__(self, trajectory) -> Float[Array, ""]:
@@ -175,7 +169,7 @@ class Returns(AbstractMeasure):
     """
 
     unit: ClassVar[str] = ""
-    point: Float[Array, "3"] = eqx.field(converter=_point)
+    point: Float[Array, "3"] = eqx.field(converter=as_point)
     within: float = eqx.field(static=True)
     after: int = eqx.field(static=True, default=1)
 
