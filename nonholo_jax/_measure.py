@@ -1,5 +1,6 @@
 """What is measured of a trajectory in a Monte Carlo study. Any function of a `Trajectory` may be; these are ready."""
 
+import functools
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
@@ -10,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ._goal import as_point
-from ._trajectory import Trajectory
+from ._trajectory import ImpactLog, Trajectory
+from ._types import KINDS, NO_IMPACTS
 from ._vector import frozen
 
 _SAMPLES = 17  # of an arc, of which the nearest begins Newton's method
@@ -61,13 +63,19 @@ def flat(measures: Iterable[Any], trajectory: Trajectory) -> Float[Array, " q"]:
     return jnp.concatenate(parts) if parts else jnp.zeros((0,), dtype)
 
 
+def struck(log: ImpactLog) -> Any:
+    """The rows of a log that are impacts: not where a ball left an edge or ceased to slip, nor those that are unused."""
+    others = [log.kind == getattr(KINDS, name) for name in NO_IMPACTS]
+    return (log.surface >= 0) & ~functools.reduce(jnp.logical_or, others)
+
+
 def _row(trajectory: Trajectory, surface: str | None, count: int) -> tuple[Any, Any]:
     """The row of the log with that impact on that surface, and whether there is one."""
     log = trajectory.impacts
     names = trajectory.system.names
     if surface is not None and surface not in names:
         raise ValueError(f"Argument `surface` must be one of {', '.join(names)}, but got {surface!r}.")
-    wanted = log.surface >= 0 if surface is None else log.surface == names.index(surface)
+    wanted = struck(log) if surface is None else struck(log) & (log.surface == names.index(surface))
     there = wanted & (jnp.cumsum(wanted, dtype=jnp.int32) == count)
     return jnp.argmax(there), jnp.any(there)
 

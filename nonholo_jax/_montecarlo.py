@@ -1,6 +1,5 @@
 """Batch Monte Carlo: throws drawn, run and measured chunk by chunk, in memory that does not grow with their number."""
 
-import functools
 import time
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +15,7 @@ from tqdm import tqdm
 
 from ._ball import BallState
 from ._ensemble import Ensemble
-from ._measure import AbstractMeasure, ImpactCount, flat, quantities_of
+from ._measure import AbstractMeasure, ImpactCount, flat, quantities_of, struck
 from ._motion import AbstractMotion
 from ._sampler import SOBOL_MOST, Sampler, halves, uniforms
 from ._scene import Scene
@@ -24,7 +23,7 @@ from ._simulate import checked, simulate
 from ._statistics import Frame, Sums, Totals, frame_of, means, sums_of
 from ._store import Store
 from ._tiles import by_tiles, over_devices
-from ._types import KINDS, NAMES_OF_RESULTS, NO_IMPACTS
+from ._types import NAMES_OF_RESULTS
 
 _PILOT = 1024  # throws that choose the edges of histograms
 _CHUNKS, _CHUNK = 32, (1024, 16_384)  # at least so many, of sizes between
@@ -287,8 +286,7 @@ def _run_chunk(plan: _Plan, scene, sampler, key, motion, t0, t1, lanes) -> _Foun
         values = flat(plan.measures, trajectory)
         code = jnp.asarray(trajectory.result._value, dtype=jnp.int32)
         log = trajectory.impacts
-        others = functools.reduce(jnp.logical_or, [log.kind == getattr(KINDS, name) for name in NO_IMPACTS])
-        hits = jnp.where(others, -1, log.surface).astype(jnp.int16)
+        hits = jnp.where(struck(log), log.surface, -1).astype(jnp.int16)
         return _Found(inputs, values, hits, code)
 
     arrays, constants = eqx.partition((scene, sampler, key, motion, t0, t1), eqx.is_array)
