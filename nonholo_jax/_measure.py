@@ -64,7 +64,7 @@ def flat(measures: Iterable[Any], trajectory: Trajectory) -> Float[Array, " q"]:
 
 
 def struck(log: ImpactLog) -> Any:
-    """The rows of a log that are impacts: not where a ball left an edge or ceased to slip, nor those that are unused."""
+    """The rows of a log that are impacts: not where a ball left an edge or ceased to slip, nor unused ones."""
     others = [log.kind == getattr(KINDS, name) for name in NO_IMPACTS]
     return (log.surface >= 0) & ~functools.reduce(jnp.logical_or, others)
 

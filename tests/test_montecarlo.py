@@ -42,6 +42,7 @@ from nonholo_jax import (
     monte_carlo,
     simulate,
 )
+from nonholo_jax._measure import struck
 from nonholo_jax._montecarlo import _spelled
 
 G, T1 = 9.81, 1.2
@@ -211,6 +212,18 @@ def test_distance_is_that_of_the_path(air):
         found = float(Distance(point, after)(trajectory))
         assert abs(found - wanted) < (1e-6 if air is None else 5e-5), (point, found, wanted)
     assert np.isnan(Distance((0.0, 0.0, 0.0), 13)(trajectory))
+
+
+def test_an_edge_that_is_left_is_no_landing():
+    """A ball that rolls off a table comes to the table once, by a train, and then to the floor."""
+    table_top = Box(center=(0.0, 0.0, 0.485), half_size=(0.5, 0.5, 0.015), law=Rough(0.5))
+    room = Scene(Ball(0.025, 0.046), {"floor": FLOOR, "table": table_top})
+    trajectory = simulate(room, BallState([0.0, 0.0, 0.6], [1.2, 0.0, 0.0], [0.0, 0.0, 0.0]), t1=1.5)
+    rows = [int(i) for i in trajectory.impacts.surface if i >= 0]
+    assert rows.count(1) == int(struck(trajectory.impacts).sum()) - rows.count(0) + 1  # one row is that of the edge
+    assert int(struck(trajectory.impacts).sum()) < len(rows)
+    last = int(jnp.sum(struck(trajectory.impacts) & (trajectory.impacts.surface == 1)))
+    assert np.isfinite(LandingTime("table", last)(trajectory)) and np.isnan(LandingTime("table", last + 1)(trajectory))
 
 
 # Folders
