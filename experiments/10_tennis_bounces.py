@@ -16,7 +16,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import machine
+from report import Check, table
 
 from nonholo_jax import Ball, BallState, Frictional, Plane, Rough, Scene, compare, fit
 from nonholo_jax.plot import plot_fits
@@ -35,13 +35,21 @@ LAWS = {
 }
 
 
+def _rows() -> list[dict]:
+    lines = [line for line in (HERE / "data/cross2002_tennis.csv").read_text().splitlines() if not line.startswith("#")]
+    return [{k: x if k == "surface" else float(x) for k, x in row.items()} for row in csv.DictReader(lines)]
+
+
+def _restitution(row: dict) -> float:
+    rise, fall = (row[f"v_{w}"] * np.sin(np.radians(row[f"angle_{w}_deg"])) for w in ("out", "in"))
+    return rise / fall
+
+
 def bounces() -> dict[str, tuple[BallState, np.ndarray]]:
     """By surface: the ball just before it touches, and what was measured after (v along, v up, spin times radius)."""
-    lines = [line for line in (HERE / "data/cross2002_tennis.csv").read_text().splitlines() if not line.startswith("#")]
-    rows = list(csv.DictReader(lines))
-    found = {}
+    rows, found = _rows(), {}
     for surface in dict.fromkeys(row["surface"] for row in rows):
-        own = [{k: float(x) for k, x in row.items() if k != "surface"} for row in rows if row["surface"] == surface]
+        own = [row for row in rows if row["surface"] == surface]
         angle = np.radians([row["angle_in_deg"] for row in own])
         speed = np.array([row["v_in"] for row in own])
         velocity = np.stack([speed * np.cos(angle), 0 * speed, -speed * np.sin(angle)], axis=-1)
@@ -61,20 +69,41 @@ def after(trajectory):
     return jnp.stack([log.velocity[0, 0], log.velocity[0, 2], RADIUS * log.spin[0, 1]])
 
 
-def fits(throws: BallState, measured: np.ndarray) -> dict:
+def fits(throws: BallState, measured: np.ndarray, *names: str) -> dict:
     found = {}
-    for name, (law, free) in LAWS.items():
+    for name in names or LAWS:
+        law, free = LAWS[name]
         scene = Scene(Ball(RADIUS, MASS, INERTIA_RATIO), {"ground": Plane((0, 0, 0), (0, 0, 1), law)})
         options = {"observe": after, "t1": 1e-3, "max_impacts": 1}
         found[name] = fit(scene, throws, measured, free=[LAW + each for each in free], **options)
     return found
 
 
+def checks(names: tuple[str, ...] | None = None) -> list[Check]:
+    """What the fit must agree with: the two coefficients of the rough ball are linear in the data, so that their least
+    squares have closed forms, and the restitution that Cross printed follows from his speeds and angles."""
+    by_surface = {name: data for name, data in bounces().items() if names is None or name in names}
+    rows = []
+    for surface, (throws, measured) in by_surface.items():
+        found = fits(throws, measured, "Rough, 2")["Rough, 2"]
+        arriving = np.asarray(throws.velocity)
+        e_n = -(measured[:, 1] @ arriving[:, 2]) / (arriving[:, 2] @ arriving[:, 2])
+        # v+ = v - k (1 + e_t) v and R w+ = (1 - k) (1 + e_t) v, of a ball that does not spin, k = alpha / (1 + alpha)
+        k, along = INERTIA_RATIO / (1.0 + INERTIA_RATIO), arriving[:, 0]
+        slope = np.concatenate([-k * along, (1.0 - k) * along])
+        rest = np.concatenate([measured[:, 0] - along, measured[:, 2]])
+        e_t = rest @ slope / (slope @ slope) - 1.0
+        rows.append(Check(f"{surface}: restitution, against its closed form", abs(found.values[0] - e_n), 1e-8))
+        rows.append(Check(f"{surface}: tangential, against its closed form", abs(found.values[1] - e_t), 1e-8))
+    printed = max(abs(row["e_y"] - _restitution(row)) for row in _rows())
+    return [*rows, Check("restitution that Cross printed, against his speeds and angles", printed, 0.01)]
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--out", default="nonholo-out/10_tennis_bounces")
     options = parser.parse_args()
-    print(machine())
+    code = table("Bounces of a tennis ball", checks())
     every = {}
     for surface, (throws, measured) in bounces().items():
         found = every[surface] = fits(throws, measured)
@@ -89,7 +118,7 @@ def main() -> int:
     rows = [f"{angle}\N{DEGREE SIGN} {what}" for angle in (20, 45) for what in ("along", "up", "spin")]
     plot_fits(every, rows=rows, unit="m/s", path=folder / "residuals.png")
     print(f"\npicture: {folder / 'residuals.png'}")
-    return 0
+    return code
 
 
 if __name__ == "__main__":

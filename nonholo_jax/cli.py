@@ -324,10 +324,11 @@ def _design(file: Any, options: argparse.Namespace) -> _Answer:
     if not answer.converged:
         text += ["", "what each start did:", *(f"  {line}" for line in starts)]
         asked = " after " + ", ".join(file.design.itinerary) if file.design.itinerary else ""
-        failure = (
-            f"no throw within `bounds` reached the goal{asked}: the best of {len(starts)} starts missed by "
-            f"{answer.miss:.3g} m; widen `design.bounds`, free more, raise `n_starts`, or change the itinerary"
-        )
+        best = f"the best of {len(starts)} starts missed by {answer.miss:.3g} m"
+        if not math.isfinite(answer.miss):
+            best = f"none of {len(starts)} starts hit these surfaces in this order"
+        remedy = "widen `design.bounds`, free more, raise `n_starts`, or change the itinerary"
+        failure = f"no throw within `bounds` reached the goal{asked}: {best}; {remedy}"
     goal = file.design.goal
     drawing = {"hand" if isinstance(goal, ReturnTo) else "target": goal.point}
     return _Answer(report, text, answer.trajectory, drawing, failure)

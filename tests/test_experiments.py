@@ -32,6 +32,7 @@ SMALL = {
     "07": lambda: script("07").checks(script("07").CASES[3:], 10.0 ** np.arange(8, 13)),
     "08": lambda: script("08").checks(("turntable",), steps=2000, step_sizes=0.2 / 2 ** np.arange(4)),
     "09": lambda: script("09").checks((2.5,), (0.6,)),
+    "10": lambda: script("10").checks(("wood",)),
 }
 
 
