@@ -1,10 +1,10 @@
 """What a Monte Carlo study costs beside the batches that it is made of: sampling, measures, sums, files.
 
 For scenes with a [monte_carlo] table: throws a second of `simulate_batch` alone on throws drawn before, with the same
-log and in batches of the size of a chunk; of `monte_carlo` without and with a folder; by turns, on one device and, in a
-process of its own, on as many as there are cores.
+log, what varies of the scene mapped, in batches of the size of a chunk; of `monte_carlo` without and with a folder; by
+turns, on one device and, in a process of its own, on as many as there are cores.
 
-    python experiments/bench_montecarlo.py [--throws 131072] [--runs 3] [--devices N]
+    python experiments/bench_montecarlo.py [--throws 262144] [--runs 3] [--devices N]
 """
 
 import argparse
@@ -45,7 +45,8 @@ def measure(n: int, runs: int) -> None:
         import numpy as np
 
         scenes, states = drawn(halves(np.arange(CHUNK)))
-        axes = jax.tree.map(lambda x: 0 if eqx.is_array(x) else None, scenes)
+        axes = jax.tree.map(lambda x: 0 if eqx.is_array(x) and _varies(np.asarray(x)) else None, scenes)
+        scenes = jax.tree.map(lambda x, axis: x[0] if eqx.is_array(x) and axis is None else x, scenes, axes)
         rows = arguments["itinerary_length"]
 
         def batches(scenes=scenes, states=states, axes=axes, rows=rows, how=how):
@@ -70,9 +71,13 @@ def measure(n: int, runs: int) -> None:
             print(f"{head}  {times}  {base / each:.2f} of simulate_batch", flush=True)
 
 
+def _varies(x) -> bool:
+    return bool((x != x[:1]).any())
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("--throws", type=int, default=131_072)
+    parser.add_argument("--throws", type=int, default=262_144)
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--devices", type=int)
     options = parser.parse_args()

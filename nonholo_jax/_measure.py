@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ._goal import as_point
+from ._shared import shared
+from ._tiles import along
 from ._trajectory import ImpactLog, Trajectory
 from ._types import KINDS, NO_IMPACTS
 from ._vector import frozen
@@ -193,74 +195,81 @@ def _nearest(trajectory: Trajectory, point: Any, after: int) -> Any:
     """The smallest distance to a point on the arcs that begin with impact number `after`."""
     log, dtype = trajectory.impacts, trajectory.t1.dtype
     rows = log.time.shape[0]
-    point, first = point.astype(dtype), jax.tree.map(lambda x: x[None], trajectory.initial)
-    last = jax.tree.map(lambda x: x[None], trajectory.final)
-    if rows == 0 and after > 0:
+    if after > rows:
         return jnp.asarray(jnp.nan, dtype)
-    join = lambda *xs: jnp.concatenate([jnp.asarray(x) for x in xs])  # noqa: E731
+    first, last = (jax.tree.map(lambda x: x[None], state) for state in (trajectory.initial, trajectory.final))
+    join = lambda *xs: jnp.concatenate([jnp.asarray(x) for x in xs])[after:]  # noqa: E731
     begins, phases = join(trajectory.t0[None], log.until), join(-jnp.ones(1, jnp.int32), log.support)
     starts = jax.tree.map(join, first, log.after)
-    arc = jnp.arange(rows + 1, dtype=jnp.int32)
+    arc = after + jnp.arange(rows + 1 - after, dtype=jnp.int32)
     is_last = arc == trajectory.n_impacts
-    ends = join(log.time, trajectory.t1[None])
-    ends = jnp.where(is_last, trajectory.t1, ends)
-    arrivals = jax.tree.map(
-        lambda x, y: jnp.where(is_last.reshape((-1,) + (1,) * (y.ndim - 1)), y, join(x, y)), log.before, last
-    )
-    there = (arc >= after) & (arc <= trajectory.n_impacts) & (is_last | (arc < rows))
-    if rows == 0:
-        there = there & is_last
-    tame = lambda x, y: jnp.where(there.reshape((-1,) + (1,) * (x.ndim - 1)), x, y)  # noqa: E731
-    harmless = jax.tree.map(lambda x: jnp.broadcast_to(x, (rows + 1, *x.shape[1:])), first)
-    starts, arrivals = (jax.tree.map(tame, x, harmless) for x in (starts, arrivals))
+    ends = jnp.where(is_last, trajectory.t1, join(log.time, trajectory.t1[None]))
+    arrivals = jax.tree.map(lambda x, y: jnp.where(along(is_last, y), y, join(x, y)), log.before, last)
+    there = is_last | ((arc < trajectory.n_impacts) & (arc < rows))
+    tame = lambda x, y: jnp.where(along(there, x), x, y)  # noqa: E731
+    starts, arrivals = (jax.tree.map(tame, x, first) for x in (starts, arrivals))
     begins, ends = jnp.where(there, begins, 0.0), jnp.where(there, ends, 0.0)
-    of_arc = lambda *arc: _on_arc(trajectory.system, point, *arc)  # noqa: E731
-    away = jax.vmap(of_arc)(begins, ends, starts, arrivals, jnp.where(there, phases, -1))
+    of_arc = lambda *arc: _coefficients(trajectory.system, point.astype(dtype), *arc)  # noqa: E731
+    away = _nearest_of(jax.vmap(of_arc)(begins, ends, starts, arrivals, jnp.where(there, phases, -1)))
     found = jnp.min(jnp.where(there, away, jnp.inf))
     return jnp.where(jnp.isfinite(found), found, jnp.nan)
 
 
-def _on_arc(system: Any, point: Any, begin: Any, end: Any, start: Any, arrival: Any, phase: Any) -> Any:
+def _coefficients(system: Any, point: Any, begin: Any, end: Any, start: Any, arrival: Any, phase: Any) -> list:
+    """Of the polynomials of degree five, one for each component, that take an arc, as seen from a point, to [0, 1]."""
     free, h = system.without_contacts(), end - begin
 
     def pull(time: Any, state: Any) -> Any:
         inner = free.unpacked(state, phase)
         _, rate = free.derivative(time, inner, *free.evolving(inner))
-        return jnp.stack([jnp.asarray(x, dtype=h.dtype) for x in rate[:3]])
+        return [jnp.asarray(x, dtype=h.dtype) for x in rate[:3]]
 
-    x, v, a = start.position - point, h * start.velocity, h * h * pull(begin, start)
-    far = arrival.position - point - (x + v + 0.5 * a)
-    fast, strong = h * arrival.velocity - (v + a), h * h * pull(end, arrival) - a
-    parts = (x, v, 0.5 * a, 10.0 * far - 4.0 * fast + 0.5 * strong, -15.0 * far + 7.0 * fast - strong,
-             6.0 * far - 3.0 * fast + 0.5 * strong)  # fmt: skip
-    return _nearest_of(jnp.stack(parts))
+    found = []
+    for i, (a, b) in enumerate(zip(pull(begin, start), pull(end, arrival), strict=True)):
+        x, v, a = start.position[i] - point[i], h * start.velocity[i], h * h * a
+        far = arrival.position[i] - point[i] - (x + v + 0.5 * a)
+        fast, strong = h * arrival.velocity[i] - (v + a), h * h * b - a
+        found.append((x, v, 0.5 * a, 10.0 * far - 4.0 * fast + 0.5 * strong, -15.0 * far + 7.0 * fast - strong,
+                      6.0 * far - 3.0 * fast + 0.5 * strong))  # fmt: skip
+    return found
 
 
 def _nearest_of(parts: Any) -> Any:
-    """The smallest length of a polynomial of degree five on [0, 1], of coefficients of shape (6, 3)."""
+    """The smallest length of a vector whose three components are polynomials of degree five on [0, 1], for many. One
+    number after the other, each an array over the arcs: a compiler makes one loop of that."""
+    numbers = shared([number for part in parts for number in part])
+    parts = [numbers[k : k + 6] for k in range(0, len(numbers), 6)]
     still = frozen(parts)
-    s = jnp.linspace(0.0, 1.0, _SAMPLES, dtype=parts.dtype)
-    at = sum(still[k][None] * (s**k)[:, None] for k in range(6))
-    nearest = jnp.argmin(jnp.sum(at**2, axis=-1))
-    low, high = s[jnp.maximum(nearest - 1, 0)], s[jnp.minimum(nearest + 1, _SAMPLES - 1)]
-    s = s[nearest]
-
-    def derivatives(s: Any) -> tuple[Any, Any, Any]:
-        x, v, a = still[5], jnp.zeros(3, parts.dtype), jnp.zeros(3, parts.dtype)
-        for k in (4, 3, 2, 1, 0):
-            x, v, a = still[k] + s * x, x + s * v, v + s * a
-        return x, v, 2.0 * a
-
+    s, square = jnp.zeros_like(still[0][0]), sum(part[0] ** 2 for part in still)
+    for k in range(1, _SAMPLES):
+        here = k / (_SAMPLES - 1)
+        new = sum(_at(part, here) ** 2 for part in still)
+        s, square = jnp.where(new < square, here, s), jnp.minimum(new, square)
+    (s,) = shared([s])
+    low, high = jnp.maximum(s - 1.0 / (_SAMPLES - 1), 0.0), jnp.minimum(s + 1.0 / (_SAMPLES - 1), 1.0)
     for _ in range(_NEWTON_STEPS):
-        x, v, a = derivatives(s)
-        speed = jnp.sum(v * v)
-        curvature = speed + jnp.sum(x * a)
+        places, speeds, pulls = (jnp.stack(each) for each in zip(*[_expanded(part, s) for part in still], strict=True))
+        speed = jnp.sum(speeds * speeds, axis=0)
+        curvature = speed + jnp.sum(places * pulls, axis=0)
         curvature = jnp.where(curvature > 0, curvature, speed)
-        step = jnp.sum(x * v) / jnp.where(curvature > 0, curvature, 1.0)
-        s = jnp.clip(s - step, low, high)
+        step = jnp.sum(places * speeds, axis=0) / jnp.where(curvature > 0, curvature, 1.0)
+        (s,) = shared([jnp.clip(s - step, low, high)])
     # At the closest point the distance does not depend on s to first order.
-    place = parts[5]
-    for k in (4, 3, 2, 1, 0):
-        place = parts[k] + s * place
-    square = jnp.sum(place * place)
+    square = sum(_at(part, s) ** 2 for part in parts)
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def _at(part: tuple, s: Any) -> Any:
+    """A polynomial, by Horner's rule."""
+    value = part[5]
+    for k in (4, 3, 2, 1, 0):
+        value = part[k] + s * value
+    return value
+
+
+def _expanded(part: tuple, s: Any) -> tuple[Any, Any, Any]:
+    """A polynomial and its first two derivatives."""
+    x, v, a = part[5], jnp.zeros_like(part[5]), jnp.zeros_like(part[5])
+    for k in (4, 3, 2, 1, 0):
+        x, v, a = part[k] + s * x, x + s * v, v + s * a
+    return x, v, 2.0 * a

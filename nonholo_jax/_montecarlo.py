@@ -315,6 +315,7 @@ class _Runner:
         self.began = time.monotonic()
         self.reached = 0  # chunks that are in the totals, which take them in their order
         self.held: Sums | None = None
+        self.ahead: dict[int, _Found] = {}  # chunks that were computed for the frame
 
     def run(self, resume: bool) -> Ensemble:
         if self.store is not None:
@@ -349,9 +350,9 @@ class _Runner:
         found = None if self.store is None else self.store.load_frame()
         if found is not None:
             return found
-        count, size = min(_PILOT, self.study.n), self.study.chunk
-        parts = [self.study.found(i, min(size, count - i)).values for i in range(0, count, size)]
-        values = np.concatenate([np.asarray(part, dtype=float) for part in parts])
+        count = min(_PILOT, self.study.n)
+        self.ahead = {k: self._launch(k) for k in range(-(-count // self.study.chunk))}
+        values = np.concatenate([np.asarray(part.values, dtype=float) for part in self.ahead.values()])[:count]
         frame = frame_of(values, self.study.pairs, tuple(each.event for each in self.study.quantities))
         if self.store is not None:
             self.store.save_frame(frame)
@@ -362,6 +363,8 @@ class _Runner:
 
     def _launch(self, k: int) -> _Found:
         """Begin to compute a chunk; JAX returns before it is done."""
+        if k in self.ahead:
+            return self.ahead.pop(k)
         start = k * self.study.chunk
         return self.study.found(start, min(self.study.chunk, self.study.n - start))
 
