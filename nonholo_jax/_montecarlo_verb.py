@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from ._ensemble import Ensemble
+from ._measure import ImpactCount
 from ._montecarlo import monte_carlo
+from ._sensitivity import Propagation, propagate
 
-_ITINERARIES = 8
+_ITINERARIES, _PARTS = 8, 3
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +21,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, help="stop after the chunk that is under way then")
     stop = "stop once the standard error of a quantity is as small; may be repeated"
     parser.add_argument("--standard-error", metavar="NAME=VALUE", action="append", default=[], help=stop)
+    linear = "compare with first-order propagation of the spread, by one Jacobian, and say where that misleads"
+    parser.add_argument("--first-order", action="store_true", help=linear)
     parser.add_argument("--records", metavar="COLUMNS", help="columns to keep of every throw, with commas, or all")
     parser.add_argument("--where", metavar="EVENT", help="keep only throws with this event")
     parser.add_argument("--coordinator", metavar="HOST:PORT", help="of several processes that share a folder")
@@ -76,6 +80,35 @@ def run(file: Any, options: argparse.Namespace, folder: Path, progress: bool) ->
         record_where=options.where,
         progress=progress,
     )
+
+
+def first_order(file: Any) -> Propagation:
+    arguments = {**file.monte_carlo.arguments, **file.simulate.arguments}
+    sampler, measures = arguments.pop("sampler"), arguments.pop("measures") or {"impacts": ImpactCount()}
+    arguments = {name: value for name, value in arguments.items() if name not in ("n", "key")}
+    return propagate(file.scene, sampler, measures=measures, **arguments)
+
+
+def report_of_first_order(linear: Propagation, found: Ensemble) -> dict[str, Any]:
+    """For machines: of every quantity its value for the central throw, its spread, and the spread by each input."""
+    quantities = {}
+    for name, mean in zip(linear.names, linear.mean, strict=True):
+        spread = {"standard_deviation": linear.standard_deviation(name), "parts": linear.parts(name)}
+        quantities[name] = {"mean": float(mean), **spread}
+    return {"itinerary": list(linear.itinerary), "quantities": quantities, "warnings": linear.against(found)}
+
+
+def table_of_first_order(linear: Propagation, found: Ensemble) -> list[str]:
+    """For people."""
+    width = max(len("to first order"), *(len(name) for name in linear.names))
+    lines = ["", f"  {'to first order':{width}}  {'mean':>12}  {'std. dev.':>10}  most of it by"]
+    rounding = 1e-12 * float(abs(linear.mean).max(initial=0.0))
+    for name, mean in zip(linear.names, linear.mean, strict=True):
+        parts = sorted(linear.parts(name).items(), key=lambda item: -item[1])[:_PARTS]
+        most = ", ".join(f"{each.removeprefix('throw.')} {size:.2g}" for each, size in parts if size > rounding)
+        lines.append(f"  {name:{width}}  {mean:12.6g}  {linear.standard_deviation(name):10.3g}  {most}".rstrip())
+    warnings = linear.against(found)
+    return lines + ["", *(f"  warning: {line}" for line in warnings)] if warnings else lines
 
 
 def report(found: Ensemble) -> dict[str, Any]:

@@ -52,7 +52,9 @@ class Propagation(NamedTuple):
         length = max((len(each.what) for each in found.itineraries), default=0)
         same = sum(each.count for each in found.itineraries if each.what == self.itinerary[:length])
         way = " ".join(self.itinerary) or "no impact"
-        reason = f"{1.0 - same / found.n:.2%} of the throws take other ways than the central one ({way})"
+        others = f"{1.0 - same / found.n:.2%} of the throws take other ways than the central one ({way})"
+        curved = f"all take the way of the central one ({way}), but the map from inputs to this is curved"
+        reason = curved if same == found.n else others
         lines, rounding = [], 1e-9 * float(np.abs(self.mean).max(initial=0.0))
         for i, name in enumerate(self.names):
             mean, error, spread = found.mean(name), found.standard_error(name), found.standard_deviation(name)
@@ -168,16 +170,19 @@ def expectation(
     sampler.names(scene)
     motion, rows = checked(scene, motion, max_impacts, min(itinerary_length, max_impacts), sum_trains)
     options = {"max_impacts": max_impacts, "log_size": rows, "motion": motion, "sum_trains": sum_trains}
-    count, first, second = 0, 0.0, 0.0
+    count, first, second, shift = 0, 0.0, 0.0, None
     for start in range(0, n, _CHUNK):
         index = np.minimum(np.arange(start, start + _CHUNK, dtype=np.int64), n - 1)
         found = _slopes(build, measure, parameters, key, t0, t1, options, halves(index))
         values = np.asarray(found, dtype=float)[: min(_CHUNK, n - start)]
         values = values[np.isfinite(values[:, 0])]
-        count, first, second = count + len(values), first + values.sum(axis=0), second + (values**2).sum(axis=0)
+        shift = values[0] if shift is None and len(values) else shift  # sums of squares keep their digits
+        moved = values if shift is None else values - shift
+        count, first, second = count + len(values), first + moved.sum(axis=0), second + (moved**2).sum(axis=0)
     with np.errstate(all="ignore"):
         mean = np.asarray(first / np.float64(count))
         error = np.sqrt(np.maximum(second / np.float64(count) - mean**2, 0.0) / np.float64(count - 1))
+        mean = mean if shift is None else shift + mean
     flat_parameters, unravel = jax.flatten_util.ravel_pytree(parameters)
     gradient, spread = (unravel(jnp.asarray(x[1:], dtype=flat_parameters.dtype)) for x in (mean, error))
     return Expectation(float(mean[0]), float(error[0]), gradient, spread)

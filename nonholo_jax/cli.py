@@ -372,10 +372,15 @@ def _tradeoff(file: Any, options: argparse.Namespace) -> _Answer:
 
 
 def _montecarlo(file: Any, options: argparse.Namespace) -> _Answer:
-    from ._montecarlo_verb import report, run, table
+    from ._montecarlo_verb import first_order, report, report_of_first_order, run, table, table_of_first_order
 
     found = run(file, options, options.folder, progress=sys.stderr.isatty())
-    return _Answer({"throw": state_of(file.throw), **report(found)}, table(found), None, {"found": found}, None)
+    whole, text = {"throw": state_of(file.throw), **report(found)}, table(found)
+    if options.first_order:
+        linear = first_order(file)
+        whole["first_order"] = report_of_first_order(linear, found)
+        text += table_of_first_order(linear, found)
+    return _Answer(whole, text, None, {"found": found}, None)
 
 
 def _scattered(file: Any, n: int, spread: float, seed: int) -> Any:

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import math
 import os
 import re
 
@@ -83,6 +84,20 @@ def test_one_json_object_store_and_picture(scene, tmp_path, capsys):
     assert main(["montecarlo", scene, "--chunk", "200", "--out", "study", "--resume", "--no-plot"]) == 0
     text, error = capsys.readouterr()
     assert error == "" and "600 throws" in text and "near" in text and "itineraries" in text
+
+
+def test_first_order_stands_beside_the_answer(scene, capsys):
+    """A drop bounces back: its landing is linear in the horizontal velocity, and the spread of that is 0.1 m/s."""
+    command = ["montecarlo", scene, "--first-order", "--chunk", "200", "--no-plot"]
+    assert main([*command, "--out", "one", "--json"]) == 0
+    linear = json.loads(capsys.readouterr().out)["first_order"]
+    fall = math.sqrt(2.0 * 0.975 / 9.81)
+    found = linear["quantities"]["landing.y"]
+    assert math.isclose(found["parts"]["throw.velocity.y"], 0.1 * fall, rel_tol=1e-6) and found["mean"] == 0.0
+    assert linear["itinerary"] == ["floor"] and "near" not in linear["quantities"]
+    assert main([*command, "--out", "two", "-n", "4000"]) == 0
+    text = capsys.readouterr().out
+    assert "to first order" in text and "velocity.y" in text and "warning: " not in text
 
 
 def test_a_file_is_read_back(scene, tmp_path):

@@ -124,6 +124,9 @@ def test_gradient_of_an_expected_value():
     early = expectation(build, theta, square, n=20_000, key=2, t1=0.3)
     error = early.gradient_standard_error["spread"]
     assert abs(float(early.gradient["spread"]) - 2 * 0.3 * 0.3**2) < 5 * error and error < 2e-3
+    # A great number beside x costs its spread no digits: it is spread T.
+    far = expectation(build, theta, lambda trajectory: 1e9 + trajectory.final.position[0], n=4000, key=2, t1=0.3)
+    assert np.isclose(far.standard_error, 0.3 * 0.3 / np.sqrt(4000), rtol=0.05)
 
 
 def test_sobol_indices_of_a_sum_of_squares(tmp_path):
