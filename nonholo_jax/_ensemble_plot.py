@@ -20,6 +20,8 @@ else:  # matplotlib is loaded only when a picture is drawn
 
 _INK, _FAINT, _BAR, _BAND = "#222222", "#9a9a9a", "#0072B2", "#bcd7ea"
 _ITINERARIES = 8
+_WIDE = 5.8  # inches, of a plan
+_NEAR = 8.0  # times the size of a cloud of places: what of the room is drawn with it
 _ABOVE = View(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), 0.0, False)
 
 
@@ -40,9 +42,8 @@ def plot_ensemble(found: Ensemble, *, quantity: str | None = None, path: str | P
         raise ValueError(f"Argument `quantity` must be one of {', '.join(names)}, but got {quantity!r}.")
     numbers = [each.name for each in found.quantities if not each.event]
     events = [each.name for each in found.quantities if each.event]
+    plans = [(k, *_extent(found, k)) for k, plane in enumerate(found.sums.planes) if plane.sum()]
     panels = []
-    if found.frame.pairs and found.sums.planes[0].sum():
-        panels.append(lambda ax: _places(ax, found))
     spread = quantity if quantity in numbers else next(iter(_spread(found, numbers)), None)
     if spread is not None:
         panels.append(lambda ax: _distribution(ax, found, spread))
@@ -51,15 +52,19 @@ def plot_ensemble(found: Ensemble, *, quantity: str | None = None, path: str | P
     estimated = quantity or next(iter([*events, *numbers]), None)
     if estimated is not None:
         panels.append(lambda ax: _convergence(ax, found, estimated))
-    rows = -(-len(panels) // 2)
-    figure = Figure(figsize=(7.6, 3.1 * max(rows, 1) + 0.3), layout="constrained")
-    axes = figure.subplots(max(rows, 1), 2, squeeze=False).ravel()
-    for ax, draw in zip(axes, panels, strict=False):
-        draw(ax)
+    deep = [_WIDE * min(max((high - low)[1] / (high - low)[0], 0.15), 0.6) + 0.8 for _, low, high in plans]
+    deep += [2.8] * -(-len(panels) // 2)
+    figure = Figure(figsize=(7.6, sum(deep, 0.3)), layout="constrained")
+    grid = figure.add_gridspec(max(len(deep), 1), 2, height_ratios=deep or None)
+    for row, (k, low, high) in enumerate(plans):
+        _places(figure.add_subplot(grid[row, :]), found, k, low, high)
+    for i, draw in enumerate(panels):
+        last = i == len(panels) - 1 and i % 2 == 0  # alone in its row
+        row = len(plans) + i // 2
+        draw(figure.add_subplot(grid[row, :] if last else grid[row, i % 2]))
+    for ax in figure.axes:
         ax.tick_params(labelsize=8, length=3, width=0.7)
         ax.spines[:].set(linewidth=0.7)
-    for ax in axes[len(panels) :]:
-        ax.remove()
     figure.suptitle(f"{found.n:,} throws", fontsize=10, x=0.02, ha="left")
     if path is not None:
         figure.savefig(path, dpi=160)
@@ -78,30 +83,53 @@ def _label(found: Ensemble, name: str) -> str:
     return f"{name} ({unit})" if unit else name
 
 
-def _places(ax: Axes, found: Ensemble) -> None:
+def _extent(found: Ensemble, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of a plan: the places, and what of the room has an end and is near."""
+    i, j = found.frame.pairs[k]
+    x, y, counts = found.frame.edges[i], found.frame.edges[j], found.sums.planes[k]
+    used = [np.flatnonzero(counts.sum(axis=axis)) for axis in (1, 0)]
+    low = np.array([x[used[0][0]], y[used[1][0]]])
+    high = np.array([x[used[0][-1] + 1], y[used[1][-1] + 1]])
+    wide = float(max(high - low))
+    for points in _outlines(found, (low + high) / 2, (1.0 + _NEAR) * wide):
+        below, above = points.min(axis=0), points.max(axis=0)
+        if max(*(above - low), *(high - below)) <= _NEAR * wide:
+            low, high = np.minimum(low, below), np.maximum(high, above)
+    rim = 0.05 * max(high - low)
+    return low - rim, high + rim
+
+
+def _outlines(found: Ensemble, center: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Of the bodies of the room that have an end, from above; a study that was opened from its folder has no room."""
+    if found.scene is None:
+        return []
+    shapes = [shape for part in room(found.scene, _ABOVE, center, reach) for shape in part]
+    return [np.asarray(shape.points) for shape in shapes if shape.inward is None]
+
+
+def _places(ax: Axes, found: Ensemble, k: int, low: np.ndarray, high: np.ndarray) -> None:
     from matplotlib.colors import LogNorm
     from matplotlib.patches import Polygon
 
-    i, j = found.frame.pairs[0]
-    x, y, counts = found.frame.edges[i], found.frame.edges[j], found.sums.planes[0]
+    i, j = found.frame.pairs[k]
+    x, y, counts = found.frame.edges[i], found.frame.edges[j], found.sums.planes[k]
     name = found.quantities[i].name.rsplit(".", 1)[0]
     shown = np.ma.masked_equal(counts.T, 0)
     mesh = ax.pcolormesh(x, y, shown, norm=LogNorm(1, max(counts.max(), 2)), cmap="viridis", rasterized=True)
-    bar = ax.figure.colorbar(mesh, ax=ax, shrink=0.85, pad=0.02)
+    if found.scene is not None:
+        parts = room(found.scene, _ABOVE, (low + high) / 2, float(np.linalg.norm(high - low)))
+        for body, part in zip(found.scene.names, parts, strict=True):
+            for shape in part:
+                closed, points = shape.inward is None, np.asarray(shape.points)
+                ax.add_patch(Polygon(points, closed=closed, fill=False, ec=_INK, lw=0.9, ls=(0, (4, 2))))
+                if closed:
+                    corner = (points[:, 0].min(), points[:, 1].max())
+                    where = {"textcoords": "offset points", "va": "top", "fontsize": 7, "clip_on": True}
+                    ax.annotate(body, corner, (3, -3), **where)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    bar = ax.figure.colorbar(mesh, cax=ax.inset_axes((1.02, 0.0, 0.02, 1.0)))
     bar.set_label("throws in a cell", fontsize=8)
     bar.ax.tick_params(labelsize=7)
-    used = [np.flatnonzero(counts.sum(axis=k)) for k in (1, 0)]
-    low = np.array([x[used[0][0]], y[used[1][0]]])
-    high = np.array([x[used[0][-1] + 1], y[used[1][-1] + 1]])
-    rim = 0.1 * max(high - low)
-    low, high = low - rim, high + rim
-    if found.scene is not None:
-        reach = float(np.linalg.norm(high - low))
-        for shapes in room(found.scene, _ABOVE, (low + high) / 2, reach):
-            for shape in shapes:
-                closed = shape.inward is None
-                ax.add_patch(Polygon(shape.points, closed=closed, fill=False, ec=_INK, lw=0.9, ls=(0, (4, 2))))
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     ax.set_title(f"{name}, from above", fontsize=9, loc="left")
     ax.set_xlabel("x (m)", fontsize=8)
     ax.set_ylabel("y (m)", fontsize=8)
@@ -140,6 +168,10 @@ def _itineraries(ax: Axes, found: Ensemble) -> None:
     place = np.arange(len(labels))
     ax.barh(place, shares, xerr=errors, color=_BAND, ec=_BAR, lw=0.8, error_kw={"lw": 0.9, "ecolor": _INK})
     ax.set_yticks(place, labels, fontsize=7)
+    for y, share in zip(place, shares, strict=True):
+        ax.annotate(f"{share:.2%}", (share, y), (4, 0), textcoords="offset points", va="center", fontsize=7)
+    ax.set_xlim(0.0, 1.22 * max(shares))
+    ax.set_xticks([tick for tick in ax.get_xticks() if 0.0 <= tick <= min(1.0, 1.22 * max(shares))])
     ax.set_ylim(max(len(labels), 4) - 0.4, -0.6)
     ax.set_title("itineraries", fontsize=9, loc="left")
     ax.set_xlabel("part of the throws", fontsize=8)

@@ -44,6 +44,7 @@ from nonholo_jax import (
 )
 from nonholo_jax._measure import struck
 from nonholo_jax._montecarlo import _spelled
+from nonholo_jax.plot import plot_ensemble
 
 G, T1 = 9.81, 1.2
 FLOOR = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Rough(0.8))
@@ -251,6 +252,27 @@ def interrupted(monkeypatch, after, error):
         write(path, data)
 
     monkeypatch.setattr(store, "_write", failing)
+
+
+def test_a_picture_has_a_plan_of_every_place_with_the_room(kept):
+    """Two places, and a table that is drawn whole; every throw is in some cell of its plan."""
+    scene = Scene(SCENE.ball, {"floor": FLOOR, "table": Box((0.9, 0.0, 0.3), (0.4, 0.3, 0.02), Rough(0.8))})
+    measures = {"first": Landing(), "end": FinalPosition(), "time": LandingTime("floor")}
+    found = monte_carlo(scene, Sampler(THROW, [Vary("velocity", Normal(0.1))]), n=500, key=0, t1=1.0, measures=measures)
+    plans = {ax.get_title(loc="left"): ax for ax in plot_ensemble(found).axes}
+    for name in ("first", "end"):
+        ax = plans[f"{name}, from above"]
+        (mesh,) = ax.collections
+        assert mesh.get_array().sum() == found.present(f"{name}.x")
+        (low, high), (left, right) = ax.get_xlim(), ax.get_ylim()
+        assert low < 0.5 and high > 1.3 and left < -0.3 and right > 0.3
+        assert "table" in [text.get_text() for text in ax.texts]
+    assert {"itineraries", "mean of first.x, with its 95 % band"} <= set(plans)
+    opened = plot_ensemble(Ensemble.open(kept.folder), quantity="near")
+    titles = [ax.get_title(loc="left") for ax in opened.axes]
+    assert "landing, from above" in titles and "probability of near, with its 95 % band" in titles
+    with pytest.raises(ValueError, match="far"):
+        plot_ensemble(found, quantity="far")
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")], ids=str)
