@@ -170,8 +170,8 @@ def _itineraries(ax: Axes, found: Ensemble) -> None:
     ax.set_yticks(place, labels, fontsize=7)
     for y, share in zip(place, shares, strict=True):
         ax.annotate(f"{share:.2%}", (share, y), (4, 0), textcoords="offset points", va="center", fontsize=7)
-    ax.set_xlim(0.0, 1.22 * max(shares))
-    ax.set_xticks([tick for tick in ax.get_xticks() if 0.0 <= tick <= min(1.0, 1.22 * max(shares))])
+    ax.set_xlim(0.0, 1.3 * max(shares))
+    ax.set_xticks([tick for tick in ax.get_xticks() if 0.0 <= tick <= min(1.0, 1.3 * max(shares))])
     ax.set_ylim(max(len(labels), 4) - 0.4, -0.6)
     ax.set_title("itineraries", fontsize=9, loc="left")
     ax.set_xlabel("part of the throws", fontsize=8)
