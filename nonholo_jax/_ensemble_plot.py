@@ -88,12 +88,12 @@ def _extent(found: Ensemble, k: int) -> tuple[np.ndarray, np.ndarray]:
     i, j = found.frame.pairs[k]
     x, y, counts = found.frame.edges[i], found.frame.edges[j], found.sums.planes[k]
     used = [np.flatnonzero(counts.sum(axis=axis)) for axis in (1, 0)]
-    low = np.array([x[used[0][0]], y[used[1][0]]])
-    high = np.array([x[used[0][-1] + 1], y[used[1][-1] + 1]])
-    wide = float(max(high - low))
-    for points in _outlines(found, (low + high) / 2, (1.0 + _NEAR) * wide):
+    first = np.array([x[used[0][0]], y[used[1][0]]])
+    last = np.array([x[used[0][-1] + 1], y[used[1][-1] + 1]])
+    wide, low, high = float(max(last - first)), first, last
+    for points in _outlines(found, (first + last) / 2, (1.0 + _NEAR) * wide):
         below, above = points.min(axis=0), points.max(axis=0)
-        if max(*(above - low), *(high - below)) <= _NEAR * wide:
+        if max(*(above - first), *(last - below)) <= _NEAR * wide:
             low, high = np.minimum(low, below), np.maximum(high, above)
     rim = 0.05 * max(high - low)
     return low - rim, high + rim
