@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._motion import AbstractMotion, Exact
-from ._motion_integrated import Integrated, _rms
+from ._motion_integrated import Integrated, rms
 from ._scene import Scene
 
 _GROWTH = 20.0
@@ -49,7 +49,7 @@ def motion_for(scene: Any, accuracy: float, state: Any, t0: Any, t1: Any, closed
         tolerance = jnp.minimum(tolerance, (accuracy / (_BETWEEN * growth)) ** (4.0 / 3.0))
     # No relative part: the error is asked for in metres, however fast the ball is. Below rounding no step is accepted.
     tolerance = jnp.maximum(tolerance, 2.0 * float(jnp.finfo(dtype).eps))
-    control = diffrax.PIDController(rtol=0.0, atol=tolerance, norm=_rms)
+    control = diffrax.PIDController(rtol=0.0, atol=tolerance, norm=rms)
     solver = diffrax.Dopri8() if tight else diffrax.Tsit5()
     return Integrated(solver=solver, stepsize_controller=control, atol=accuracy / _GROWTH)
 

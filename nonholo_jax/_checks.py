@@ -8,7 +8,7 @@ import jax.core
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ._impact import _dot, _nonzero, _pseudo_inverse, _whiten
+from ._impact import divisor, matmul, pseudo_inverse, whiten
 from ._system import rounding
 from ._vector import components
 
@@ -56,12 +56,12 @@ def _frame_conditions(system: Any, q: Array) -> dict:
     """Full rank, and (I - F F^+) [F_j, F_i] = 0: brackets of the columns of F stay in their span."""
     eps = float(jnp.finfo(q.dtype).eps)
     f, df = system.frame(q), jax.jacfwd(system.frame)(q)
-    lengths = _nonzero(jnp.sqrt(jnp.sum(f**2, axis=0)))
+    lengths = divisor(jnp.sqrt(jnp.sum(f**2, axis=0)))
     basis, triangle = jnp.linalg.qr(f / lengths[None, :])
     least = jnp.min(jnp.abs(jnp.diagonal(triangle)))
     along = jnp.einsum("kil,lj->kij", df, f, precision=jax.lax.Precision.HIGHEST)
     bracket = (along - along.swapaxes(1, 2)).reshape(q.shape[0], -1)
-    outside = jnp.max(jnp.abs(bracket - _dot(basis, _dot(basis.T, bracket))), initial=0.0)
+    outside = jnp.max(jnp.abs(bracket - matmul(basis, matmul(basis.T, bracket))), initial=0.0)
     return {
         "frame": (least > 100.0 * eps * q.shape[0], least),
         "closed": (outside <= eps**0.5 * jnp.max(jnp.abs(along), initial=0.0), outside),
@@ -74,17 +74,17 @@ def fit(system: Any, index: int, t: Array, q: Array, n: int) -> dict:
     barrier, metric = system.barriers[index], system.metric_at(q)
     eps = float(jnp.finfo(q.dtype).eps)
     rows = barrier.constraint(q)
-    _, _, w, scaling = _whiten(metric, rows, thorough=False)
-    w_plus, pi = _pseudo_inverse(w)
-    c = _dot(scaling, barrier.moves(q, t, rows.shape[0]))
-    drift = _dot(w_plus, c)  # the least velocity with B v = c
+    _, _, w, scaling = whiten(metric, rows, thorough=False)
+    w_plus, pi = pseudo_inverse(w)
+    c = matmul(scaling, barrier.moves(q, t, rows.shape[0]))
+    drift = matmul(w_plus, c)  # the least velocity with B v = c
     a, b = system.constraint_at(q, t, n)
     gradient = jax.grad(barrier.gap)(q)
-    gradient = gradient if system.frame is None else _dot(gradient, system.frame(q))
-    _, _, others, scaling = _whiten(metric, jnp.concatenate([a, gradient[None, :]]), thorough=False)
-    outside, b = others - _dot(others, pi), _dot(scaling, jnp.append(b, 0.0))[:-1]
+    gradient = gradient if system.frame is None else matmul(gradient, system.frame(q))
+    _, _, others, scaling = whiten(metric, jnp.concatenate([a, gradient[None, :]]), thorough=False)
+    outside, b = others - matmul(others, pi), matmul(scaling, jnp.append(b, 0.0))[:-1]
     inside, past = _largest(outside[:-1]), _largest(outside[-1])
-    disagreement = jnp.maximum(_largest(_dot(w, drift) - c), _largest(_dot(others[:-1], drift) - b))
+    disagreement = jnp.maximum(_largest(matmul(w, drift) - c), _largest(matmul(others[:-1], drift) - b))
     size = _largest(c) + _largest(b) + jnp.sqrt(jnp.sum(drift**2))
     return {
         "inside": (inside <= eps**0.5, inside),
@@ -103,7 +103,7 @@ def conditions(system: Any, t: Array, q: Array, v: Array) -> dict[Any, tuple[Boo
     numbers = [jnp.all(jnp.isfinite(jnp.asarray(leaf))) for leaf in jax.tree.leaves((system, t, q, v))]
     found: dict[Any, Any] = {"finite": (jnp.all(jnp.stack(numbers)), t)}
     metric = system.metric_at(q)
-    scale = _nonzero(jnp.sqrt(jnp.abs(jnp.diagonal(metric))))
+    scale = divisor(jnp.sqrt(jnp.abs(jnp.diagonal(metric))))
     scaled = metric / scale[:, None] / scale[None, :]
     lopsided, pivot = _largest(scaled - scaled.T), jnp.min(jnp.diagonal(jnp.linalg.cholesky(scaled))) ** 2
     found["symmetric"] = (lopsided <= 100.0 * eps, lopsided)
@@ -120,10 +120,10 @@ def conditions(system: Any, t: Array, q: Array, v: Array) -> dict[Any, tuple[Boo
         fits = fit(system, i, t, q, n)
         found |= {(name, i): fits[name] for name in ("inside", "agreed")}
     a, b = system.constraint_at(q, t, n)
-    excess = _dot(a, v) - b
-    _, _, _, scaling = _whiten(metric, a, thorough=False)
-    size = jnp.sqrt(jnp.maximum(_dot(v, _dot(metric, v)), 0.0)) + _largest(_dot(scaling, b))
-    found["velocity"] = (_largest(_dot(scaling, excess)) <= 1e3 * eps * size, _largest(excess))
+    excess = matmul(a, v) - b
+    _, _, _, scaling = whiten(metric, a, thorough=False)
+    size = jnp.sqrt(jnp.maximum(matmul(v, matmul(metric, v)), 0.0)) + _largest(matmul(scaling, b))
+    found["velocity"] = (_largest(matmul(scaling, excess)) <= 1e3 * eps * size, _largest(excess))
     return found
 
 

@@ -6,8 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import lax
 
-from ._ball import Ball
-from ._impact import _dot
+from ._impact import matmul
 from ._law import AbstractContactLaw
 from ._types import Number, Vector3
 from ._vector import components, is_constant, root
@@ -30,7 +29,8 @@ def _rows(law: AbstractContactLaw, n: Any) -> Any:
 
 
 def collide_with_all(
-    ball: Ball,
+    radius: Number,
+    inertia_ratio: Number,
     laws: Sequence[AbstractContactLaw],
     normals: Sequence[Vector3],
     hit: Sequence[Any],
@@ -44,27 +44,27 @@ def collide_with_all(
     for law, n, flag in zip(laws, normals, hit, strict=True):
         block = _rows(law, jnp.stack([jnp.asarray(c, dtype=like.dtype) for c in n]))
         blocks.append(jnp.where(flag, block, jnp.zeros_like(block)))
-    weight = jnp.asarray(ball.inertia_ratio, dtype=like.dtype) ** 0.5
+    weight = jnp.asarray(inertia_ratio, dtype=like.dtype) ** 0.5
     stretch = jnp.concatenate([jnp.ones(3, like.dtype), jnp.full(3, weight)])  # the metric becomes the identity
-    turn = ball.radius * jnp.stack([jnp.asarray(w, dtype=like.dtype) for w in spin])
+    turn = radius * jnp.stack([jnp.asarray(w, dtype=like.dtype) for w in spin])
     y = stretch * jnp.concatenate([like, turn])
     basis = _orthonormal(jnp.concatenate(blocks) / stretch[None])
-    after = (y - (1.0 + restitution) * _dot(_dot(basis, y), basis)) / stretch
-    return components(after[:3]), components(after[3:] / ball.radius)  # pyright: ignore[reportReturnType]
+    after = (y - (1.0 + restitution) * matmul(matmul(basis, y), basis)) / stretch
+    return components(after[:3]), components(after[3:] / radius)  # pyright: ignore[reportReturnType]
 
 
 def _orthonormal(rows: Any) -> Any:
     """An orthonormal basis of the span of rows in six dimensions, filled up with zeros, by Gram and Schmidt, twice. The
-    same projector as by `_impact`, for few rows of one scale: a tenth of its program."""
+    same projector as by `projector`, for few rows of one scale: a tenth of its program."""
     tolerance = 1e3 * float(jnp.finfo(rows.dtype).eps)
 
     def one(carry, row):
         basis, count = carry
-        size = root(_dot(row, row))
+        size = root(matmul(row, row))
         row = row / jnp.where(size > 0, size, 1.0)
-        rest = row - _dot(_dot(basis, row), basis)
-        rest = rest - _dot(_dot(basis, rest), basis)
-        left = root(_dot(rest, rest))
+        rest = row - matmul(matmul(basis, row), basis)
+        rest = rest - matmul(matmul(basis, rest), basis)
+        left = root(matmul(rest, rest))
         new = jnp.asarray(left > tolerance)
         rest = jnp.where(new, rest / jnp.where(new, left, 1.0), 0.0)
         return (basis.at[count].add(rest, mode="drop"), count + new.astype(jnp.int32)), None

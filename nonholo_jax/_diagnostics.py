@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._ball import BallState
-from ._impact import _dot, _whiten, projector
+from ._impact import matmul, projector, whiten
 from ._lagrangian import LagrangianSystem, as_arrays
 from ._replay import run
 from ._scene import Scene
@@ -70,7 +70,7 @@ def energy(system: Any, state: Any) -> Float[Array, "*batch"]:
 def _contact_velocity(scene: Scene, state: BallState, n: Array, moving: Array) -> tuple[Array, Array]:
     """The normal and the tangential velocity of the contact point relative to the surface."""
     u = state.velocity - scene.ball.radius * jnp.cross(state.spin, n) - moving
-    closing = _dot(u, n)
+    closing = matmul(u, n)
     return closing, u - closing * n
 
 
@@ -127,9 +127,9 @@ def _ball_row(scene: Scene, contact: Array, time: Array, n: Array, before: Any, 
 def _row(system: LagrangianSystem, index: int, time: Array, before: Any, after: Any) -> tuple[Array, Array]:
     barrier, (q, v) = system.barriers[index], before
     rows = barrier.constraint(q)
-    _, _, _, scaling = _whiten(system.metric_at(q), rows, thorough=False)  # so that the rows have one unit
+    _, _, _, scaling = whiten(system.metric_at(q), rows, thorough=False)  # so that the rows have one unit
     c = barrier.moves(q, time, rows.shape[0])
-    old, new = (_dot(scaling, _dot(rows, x) - c) for x in (v, after[1]))
+    old, new = (matmul(scaling, matmul(rows, x) - c) for x in (v, after[1]))
     return jnp.sqrt(jnp.sum((new + barrier.restitution * old) ** 2)), jnp.sqrt(jnp.sum(old**2))
 
 
@@ -246,7 +246,7 @@ def _pulse(system: LagrangianSystem, t: Array, q: Array, contact: Array, noise: 
     for i, barrier in enumerate(system.barriers):
         blocks.append(jnp.where((contact == i) | system.touches(i, q), barrier.constraint(q), 0.0))
     e = noise / jnp.sqrt(jnp.diagonal(metric))[None, :]
-    return e - _dot(e, projector(metric, jnp.concatenate(blocks)).T)
+    return e - matmul(e, projector(metric, jnp.concatenate(blocks)).T)
 
 
 @eqx.filter_jit
@@ -275,7 +275,7 @@ def _arc_integrals(
         wave = noise[0] + jnp.cos(3.0 * s) * noise[1] + jnp.sin(4.0 * s) * noise[2]
         y = (1 - s) * pulse + s * to + s * (1 - s) * wave
         a, _ = system.constraint_at(q, t, y.shape[-1])
-        return y if a.shape[0] == 0 else y - _dot(y, projector(system.metric_at(q), a).T)
+        return y if a.shape[0] == 0 else y - matmul(y, projector(system.metric_at(q), a).T)
 
     def terms(t, q, v):
         w = system.rate(q, v)
@@ -284,7 +284,7 @@ def _arc_integrals(
         if system.forces is not None:
             slope = slope + system.forces(q, v, t)
         value, change = jax.jvp(eta, (q, t), (w, jnp.ones_like(t)))
-        return jnp.stack([_dot(value, slope), _dot(value, turning), _dot(change, p)])
+        return jnp.stack([matmul(value, slope), matmul(value, turning), matmul(change, p)])
 
     each = jax.vmap(terms)(times, q, v)
     sums = [jnp.sum(weights[:, None] * x, axis=0) for x in (jnp.sum(each, axis=1), jnp.sum(jnp.abs(each), axis=1))]

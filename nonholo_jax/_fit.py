@@ -13,11 +13,11 @@ from jaxtyping import Array
 
 from ._ball import BallState
 from ._chart import Chart, chart_of, limits_of
-from ._measure import flat
 from ._motion import AbstractMotion
 from ._names import expand, read, write
 from ._scene import Scene
 from ._simulate import checked, simulate
+from ._trajectory import flat
 
 _ADMISSIBLE = {"restitution": (0.0, 1.0), "tangential": (-1.0, 1.0), "friction": (0.0, math.inf),
                "inertia_ratio": (0.0, math.inf), "radius": (0.0, math.inf), "mass": (0.0, math.inf),

@@ -118,8 +118,7 @@ class Grounded(AbstractSystem):
             return Ground(face, edged, rolling.NONE, rolling.NONE, True)
         ball, n, friction = self.scene.ball, face.normal, self._floors.friction(state.support)
         slides = (state.support >= 0) & self._floors.rolls(state.support) & jnp.isfinite(friction)
-        slip = rolling.own_slip(ball, n, flight.velocity, flight.spin)
-        slip = _where(slides, slip, rolling.NONE)
+        slip = _where(slides, rolling.own_slip(ball.radius, n, flight.velocity, flight.spin), rolling.NONE)
         a = self._pull(time, flight)
         most = jnp.where(slides, friction, 0.0) * -dot(a, n) * (1.0 + 1.0 / ball.inertia_ratio)
         along = rolling.along_surface(n, a)
@@ -135,7 +134,7 @@ class Grounded(AbstractSystem):
         if self.scene.air is not None:
             turning = subtract(v, slip) if slip else v
             flight = flight._replace(
-                spin=_where(rolls, rolling.rolling_spin(ball, n, turning, flight.spin), flight.spin)
+                spin=_where(rolls, rolling.rolling_spin(ball.radius, n, turning, flight.spin), flight.spin)
             )
         _, a = self.scene.derivative(time, flight, q, v)
         along, alpha = rolling.along_surface(n, a), ball.inertia_ratio
@@ -161,7 +160,7 @@ class Grounded(AbstractSystem):
         flight = self.scene.advanced(time, state.flight, q[:3], v, duration)
         below, ball = self._below(time, state), self.scene.ball
         slips = (below.slip, q[3:] if self._floors.have_friction else rolling.NONE)
-        before, after = (rolling.rolling_spin(ball, below.face.normal, subtract(u, slip), flight.spin)
+        before, after = (rolling.rolling_spin(ball.radius, below.face.normal, subtract(u, slip), flight.spin)
                          for u, slip in zip((state.flight.velocity, v), slips, strict=True))  # fmt: skip
         orientation = flight.orientation
         if orientation is not None:
@@ -368,7 +367,8 @@ class Grounded(AbstractSystem):
         end = self._summed(contact, first)
         kept = self._against(contact, time, flight, state.support, face.normal)
         if self._floors.have_friction:
-            velocity, spin = rolling.gripped(self.scene.ball, face.normal, flight.velocity, flight.spin)
+            ball = self.scene.ball
+            velocity, spin = rolling.gripped(ball.radius, ball.inertia_ratio, face.normal, flight.velocity, flight.spin)
             kept = kept._replace(velocity=_where(grips, velocity, kept.velocity), spin=_where(grips, spin, kept.spin))
 
         wedged = self._is_wedged(contact, time, state)
@@ -394,8 +394,8 @@ class Grounded(AbstractSystem):
         smooth = jnp.asarray(select(contact, [float(surface.law.rolls is False) for surface in surfaces])) > 0.5
         turned = rolling.against_smooth(n, wall, mu, velocity)
         firm = self._floors.holds(support)
-        carried = _where(firm, rolling.rolling_spin(ball, n, turned, spin), spin)
-        velocity, spin = rolling.against_rough(ball, n, wall, mu, velocity, spin)
+        carried = _where(firm, rolling.rolling_spin(ball.radius, n, turned, spin), spin)
+        velocity, spin = rolling.against_rough(ball.radius, ball.inertia_ratio, n, wall, mu, velocity, spin)
         return flight._replace(velocity=_where(smooth, turned, velocity), spin=_where(smooth, carried, spin))
 
     def _normal(self, contact: Any, time: Any, x: Vector3) -> Vector3:

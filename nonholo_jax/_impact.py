@@ -12,12 +12,12 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 
-def _dot(a: Array, b: Array) -> Array:
+def matmul(a: Array, b: Array) -> Array:
     # Accelerators multiply float32 matrices in lower precision unless told otherwise.
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
-def _nonzero(x: Array) -> Array:
+def divisor(x: Array) -> Array:
     """A divisor: zeros become ones."""
     return jnp.where(x == 0, jnp.ones_like(x), x)
 
@@ -28,25 +28,25 @@ def _tolerance(x: Array) -> float:
 
 
 @jax.custom_jvp
-def _pseudo_inverse(w: Float[Array, "k n"]) -> tuple[Float[Array, "n k"], Float[Array, "n n"]]:
+def pseudo_inverse(w: Float[Array, "k n"]) -> tuple[Float[Array, "n k"], Float[Array, "n n"]]:
     """The pseudo-inverse of `w` and the orthogonal projector onto the span of its rows."""
     u, s, vt = jnp.linalg.svd(w, full_matrices=False)
     cutoff = _tolerance(w) * jnp.max(s, initial=0)
     drop = s <= cutoff  # False for NaN, which must come out again
     vt = jnp.where(drop[:, None], jnp.zeros_like(vt), vt)
     s = jnp.where(drop, jnp.ones_like(s), s)
-    return _dot(vt.T / s[None, :], u.T), _dot(vt.T, vt)
+    return matmul(vt.T / s[None, :], u.T), matmul(vt.T, vt)
 
 
-@_pseudo_inverse.defjvp
+@pseudo_inverse.defjvp
 def _pseudo_inverse_jvp(primals, tangents):
     # The derivative of the SVD divides by differences of singular values; the ball's own B has equal ones.
     # That of Golub and Pereyra (1973) has no such divisor and holds wherever the rank does not change.
     (w,), (dw,) = primals, tangents
-    w_plus, pi = _pseudo_inverse(w)
-    turn = _dot(dw.T - _dot(pi, dw.T), w_plus.T)  # (I - Pi) dW^T (W^+)^T
-    left = dw.T - _dot(_dot(dw.T, w), w_plus)  # dW^T (I - W W^+), zero if W has full row rank
-    dw_plus = _dot(turn, w_plus) + _dot(w_plus, _dot(w_plus.T, left)) - _dot(_dot(w_plus, dw), w_plus)
+    w_plus, pi = pseudo_inverse(w)
+    turn = matmul(dw.T - matmul(pi, dw.T), w_plus.T)  # (I - Pi) dW^T (W^+)^T
+    left = dw.T - matmul(matmul(dw.T, w), w_plus)  # dW^T (I - W W^+), zero if W has full row rank
+    dw_plus = matmul(turn, w_plus) + matmul(w_plus, matmul(w_plus.T, left)) - matmul(matmul(w_plus, dw), w_plus)
     return (w_plus, pi), (dw_plus, turn + turn.T)
 
 
@@ -60,7 +60,7 @@ def _reduce(b: Array) -> tuple[Array, Array]:
     for _ in range(min(k - 1, n)):
         i, j = jnp.unravel_index(jnp.argmax(jnp.where(free[:, None], jnp.abs(b), 0)), b.shape)
         free = free.at[i].set(False)
-        factor = jnp.where(free, b[:, j] / _nonzero(b[i, j]), 0)[:, None]
+        factor = jnp.where(free, b[:, j] / divisor(b[i, j]), 0)[:, None]
         size = size + jnp.abs(factor) * size[i][None, :]
         b = b - factor * b[i][None, :]
         b = jnp.where(jnp.abs(b) <= _tolerance(b) * size, jnp.zeros_like(b), b)
@@ -71,12 +71,12 @@ def _reduce(b: Array) -> tuple[Array, Array]:
 def _unit_rows(w: Array) -> tuple[Array, Array]:
     """The rows of `w` at unit length, zero rows as they are, and the factors, shape (k, 1)."""
     w_fixed = lax.stop_gradient(w)
-    largest = _nonzero(jnp.max(jnp.abs(w_fixed), axis=1, initial=0))[:, None]  # its squares may overflow
-    norm = _nonzero(jnp.sqrt(jnp.sum((w_fixed / largest) ** 2, axis=1)))[:, None]
+    largest = divisor(jnp.max(jnp.abs(w_fixed), axis=1, initial=0))[:, None]  # its squares may overflow
+    norm = divisor(jnp.sqrt(jnp.sum((w_fixed / largest) ** 2, axis=1)))[:, None]
     return w / largest / norm, 1 / largest / norm
 
 
-def _whiten(metric: Array, constraint: Array, thorough: bool = True) -> tuple[Array, Array, Array, Array]:
+def whiten(metric: Array, constraint: Array, thorough: bool = True) -> tuple[Array, Array, Array, Array]:
     """(scale, factor, w, rows): G = L L^T, L = diag(scale) factor; w = rows B L^-T has unit rows. What is not
     `thorough` is cheaper, and loses digits where rows differ only in components of little inertia."""
     # Nothing that is computed depends on `scale` or on `rows`, so neither needs a derivative.
@@ -86,7 +86,7 @@ def _whiten(metric: Array, constraint: Array, thorough: bool = True) -> tuple[Ar
     rows = jnp.eye(w.shape[0], dtype=w.dtype)
     if thorough:
         rows, reduced = _reduce(lax.stop_gradient(w))
-        w = reduced + _dot(rows, w - lax.stop_gradient(w))  # the value of `reduced`, the derivative of rows w
+        w = reduced + matmul(rows, w - lax.stop_gradient(w))  # the value of `reduced`, the derivative of rows w
     w, last = _unit_rows(jsp.linalg.solve_triangular(factor, w.T, lower=True).T)
     return scale, factor, w, last * rows * first.T
 
@@ -139,9 +139,9 @@ def projector(metric: Float[Array, "n n"], constraint: Float[Array, "k n"]) -> F
         ```
     """
     _check(metric, constraint)
-    scale, factor, w, _ = _whiten(metric, constraint)
-    _, pi = _pseudo_inverse(w)
-    p = jsp.linalg.solve_triangular(factor, _dot(pi, factor.T), trans="T", lower=True)
+    scale, factor, w, _ = whiten(metric, constraint)
+    _, pi = pseudo_inverse(w)
+    p = jsp.linalg.solve_triangular(factor, matmul(pi, factor.T), trans="T", lower=True)
     return p / scale[:, None] * scale[None, :]
 
 
@@ -199,11 +199,11 @@ def collide(
             f"Argument `offset` must have shape {constraint.shape[:1]} to match `constraint`, but got shape "
             f"{offset.shape}; try one number for each row."
         )
-    scale, factor, w, rows = _whiten(metric, constraint)
-    w_plus, pi = _pseudo_inverse(w)
-    y = _dot(pi, _dot(factor.T, scale * velocity))
+    scale, factor, w, rows = whiten(metric, constraint)
+    w_plus, pi = pseudo_inverse(w)
+    y = matmul(pi, matmul(factor.T, scale * velocity))
     if offset is not None:
-        y = y - _dot(w_plus, _dot(rows, offset))
+        y = y - matmul(w_plus, matmul(rows, offset))
     change = jsp.linalg.solve_triangular(factor, y, trans="T", lower=True) / scale
     return velocity - (1 + jnp.asarray(restitution, velocity.dtype)) * change
 
@@ -215,16 +215,16 @@ def accelerate(metric: Array, constraint: Array, force: Array, rate: Array) -> A
         scale = lax.stop_gradient(jnp.sqrt(jnp.diagonal(metric)))
         factor = jnp.linalg.cholesky(metric / scale[:, None] / scale[None, :])
         return jsp.linalg.cho_solve((factor, True), force / scale) / scale
-    scale, factor, w, rows = _whiten(metric, constraint, thorough=False)
-    w_plus, pi = _pseudo_inverse(w)
+    scale, factor, w, rows = whiten(metric, constraint, thorough=False)
+    w_plus, pi = pseudo_inverse(w)
     y = jsp.linalg.solve_triangular(factor, force / scale, lower=True)
-    y = y - _dot(pi, y) + _dot(w_plus, _dot(rows, rate))
+    y = y - matmul(pi, y) + matmul(w_plus, matmul(rows, rate))
     return jsp.linalg.solve_triangular(factor, y, trans="T", lower=True) / scale
 
 
 def settle(velocity: Array, metric: Array, constraint: Array, offset: Array) -> Array:
     """The velocity with A v = b nearest to one that nearly is so: only the excess is projected, so that what is right
     stays as it is."""
-    scale, factor, w, rows = _whiten(metric, constraint, thorough=False)
-    y = _dot(_pseudo_inverse(w)[0], _dot(rows, _dot(constraint, velocity) - offset))
+    scale, factor, w, rows = whiten(metric, constraint, thorough=False)
+    y = matmul(pseudo_inverse(w)[0], matmul(rows, matmul(constraint, velocity) - offset))
     return velocity - jsp.linalg.solve_triangular(factor, y, trans="T", lower=True) / scale

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ._checks import conditions, fit, refuse, refuse_shapes
 from ._gap import bend_of, gradient_of, reach_of, value_of
-from ._impact import _dot, accelerate, collide, settle
+from ._impact import accelerate, collide, matmul, settle
 from ._system import AbstractSystem, bounces
 from ._types import RESULTS, Number
 from ._vector import as_number, components, frozen, is_constant, select
@@ -168,11 +168,11 @@ class LagrangianSystem(AbstractSystem):
     def _lagrangian(self, q: Array, v: Array) -> Array:
         if self.lagrangian is not None:
             return self.lagrangian(q, v)
-        kinetic = 0.5 * _dot(v, _dot(self.metric(q), v))
+        kinetic = 0.5 * matmul(v, matmul(self.metric(q), v))
         return kinetic if self.potential is None else kinetic - self.potential(q)
 
     def _momentum(self, q: Array, v: Array) -> Array:
-        return jax.grad(self._lagrangian, 1)(q, v) if self.metric is None else _dot(self.metric(q), v)
+        return jax.grad(self._lagrangian, 1)(q, v) if self.metric is None else matmul(self.metric(q), v)
 
     def metric_at(self, q: Array) -> Float[Array, "n n"]:
         """G at the configuration q, shape (n, n)."""
@@ -188,12 +188,12 @@ class LagrangianSystem(AbstractSystem):
 
     def rate(self, q: Array, v: Array) -> Array:
         """dq/dt, shape (n_q,)."""
-        return v if self.frame is None else _dot(self.frame(q), v)
+        return v if self.frame is None else matmul(self.frame(q), v)
 
     def energy(self, q: Any, v: Any) -> Float[Array, ""]:
         """p . v - L, in J if everything is in SI units, of q, shape (n_q,), and v, shape (n,)."""
         q, v = as_arrays(q, v)
-        return _dot(self._momentum(q, v), v) - self._lagrangian(q, v)
+        return matmul(self._momentum(q, v), v) - self._lagrangian(q, v)
 
     def admissible(self, q: Any, v: Any, t: Any = 0.0) -> Float[Array, " n"]:
         """The velocity with A v = b that is nearest to v in the metric; shapes (n_q,) and (n,)."""
@@ -211,9 +211,9 @@ class LagrangianSystem(AbstractSystem):
             return slope, jnp.zeros_like(v)
         f, df = jax.jvp(self.frame, (q,), (w,))
         basis, triangle = jnp.linalg.qr(f)
-        y = _dot(basis, jsp.linalg.solve_triangular(triangle, p, trans="T"))  # (F^+)^T p
-        turning = jax.grad(lambda x: _dot(y, _dot(self.frame(x), v)))(q)
-        return _dot(f.T, slope), _dot(df.T, y) - _dot(f.T, turning)
+        y = matmul(basis, jsp.linalg.solve_triangular(triangle, p, trans="T"))  # (F^+)^T p
+        turning = jax.grad(lambda x: matmul(y, matmul(self.frame(x), v)))(q)
+        return matmul(f.T, slope), matmul(df.T, y) - matmul(f.T, turning)
 
     def acceleration(self, t: Array, q: Array, v: Array) -> tuple[Array, Array]:
         """(dq/dt, dv/dt), with G dv/dt = F^T dL/dq + (F^+ K)^T p + Q + A^T lambda - (dp/dq) w and
@@ -227,7 +227,7 @@ class LagrangianSystem(AbstractSystem):
 
         def excess(q, t):
             a, b = self.constraint_at(q, t, v.shape[0])
-            return b - _dot(a, v), a
+            return b - matmul(a, v), a
 
         _, rate, a = jax.jvp(excess, (q, t), (w, jnp.ones_like(t)), has_aux=True)
         return w, accelerate(self.metric_at(q), a, force, rate)
@@ -279,7 +279,7 @@ class LagrangianSystem(AbstractSystem):
             rows = barrier.constraint(q)
             offset = barrier.moves(q, time, rows.shape[0])
             if self.n_contacts > 1:
-                closing = _dot(jax.grad(barrier.gap)(q), w) < 0
+                closing = matmul(jax.grad(barrier.gap)(q), w) < 0
                 hit = (contact == i) | (self.touches(i, q) & closing & (barrier.restitution == restitution))
                 rows, offset = jnp.where(hit, rows, 0.0), jnp.where(hit, offset, 0.0)
             blocks.append(rows)

@@ -2,7 +2,7 @@
 
 import functools
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -56,13 +56,6 @@ def quantities_of(measures: Mapping[str, Any], shapes: Sequence[Any]) -> tuple[l
         letters = ("x", "y", "z") if shape.shape[0] == 3 else tuple(map(str, range(shape.shape[0])))
         found += [Quantity(f"{name}.{letter}", unit, event) for letter in letters]
     return found, tuple(pairs)
-
-
-def flat(measures: Iterable[Any], trajectory: Trajectory) -> Float[Array, " q"]:
-    """All that is measured of one trajectory."""
-    dtype = trajectory.t1.dtype
-    parts = [jnp.ravel(jnp.asarray(measure(trajectory)).astype(dtype)) for measure in measures]
-    return jnp.concatenate(parts) if parts else jnp.zeros((0,), dtype)
 
 
 def struck(log: ImpactLog) -> Any:

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from ._ball import BallState
 from ._ensemble import Ensemble
-from ._measure import AbstractMeasure, ImpactCount, flat, quantities_of, struck
+from ._measure import AbstractMeasure, ImpactCount, quantities_of, struck
 from ._motion import AbstractMotion
 from ._sampler import SOBOL_MOST, Sampler, halves, uniforms
 from ._scene import Scene
@@ -23,6 +23,7 @@ from ._simulate import checked, simulate
 from ._statistics import Frame, Sums, Totals, frame_of, means, sums_of
 from ._store import Store
 from ._tiles import by_tiles, over_devices
+from ._trajectory import flat
 from ._types import NAMES_OF_RESULTS
 
 _PILOT = 1024  # throws that choose the edges of histograms

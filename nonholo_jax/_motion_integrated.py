@@ -16,7 +16,7 @@ from ._types import Scalar
 from ._vector import frozen, plus, root, times, total
 
 
-def _rms(tree: Any) -> Any:
+def rms(tree: Any) -> Any:
     """The root mean square of scalars, without first gathering them into one array."""
     leaves = jax.tree.leaves(tree)
     return root(total([x * x for x in leaves]) / len(leaves))
@@ -90,7 +90,7 @@ class Integrated(AbstractMotion):
     @property
     def _controller(self) -> Any:
         if self.stepsize_controller is None:
-            return diffrax.PIDController(rtol=self.rtol, atol=self.atol, norm=_rms)
+            return diffrax.PIDController(rtol=self.rtol, atol=self.atol, norm=rms)
         return self.stepsize_controller
 
     def check(self, system):

@@ -11,7 +11,6 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ._ball import Ball
 from ._types import Number, Vector3
 from ._vector import add, cross, dot, norm, plus, ratio, scale, subtract, times, where_number
 
@@ -23,15 +22,15 @@ def along_surface(normal: Vector3, a: Vector3) -> Vector3:
     return subtract(a, scale(dot(a, normal), normal))
 
 
-def rolling_spin(ball: Ball, normal: Vector3, turning: Vector3, spin: Vector3) -> Vector3:
+def rolling_spin(radius: Number, normal: Vector3, turning: Vector3, spin: Vector3) -> Vector3:
     """The spin of a ball that rolls at the velocity `turning` (less its slip, if it slips): (1.1) solved for the part
     along the surface. The part about the normal stays."""
-    return add(scale(ratio(1.0, ball.radius), cross(normal, turning)), scale(dot(normal, spin), normal))
+    return add(scale(ratio(1.0, radius), cross(normal, turning)), scale(dot(normal, spin), normal))
 
 
-def own_slip(ball: Ball, normal: Vector3, velocity: Vector3, spin: Vector3) -> Vector3:
+def own_slip(radius: Number, normal: Vector3, velocity: Vector3, spin: Vector3) -> Vector3:
     """The velocity of the contact point along the surface; exactly zero where that is its rounding error."""
-    tangential, radius = along_surface(normal, velocity), ball.radius
+    tangential = along_surface(normal, velocity)
     slip = subtract(tangential, scale(radius, cross(spin, normal)))
     eps = float(jnp.finfo(jnp.result_type(*velocity)).eps)
     slips = norm(slip) > 64.0 * eps * (norm(tangential) + radius * norm(spin))
@@ -77,25 +76,33 @@ def _sideways(known: Vector3, along: Vector3) -> Number:
     return norm(subtract(along, scale(dot(known, along), known)))
 
 
-def gripped(ball: Ball, normal: Vector3, velocity: Vector3, spin: Vector3) -> tuple[Vector3, Vector3]:
+def gripped(
+    radius: Number, inertia_ratio: Number, normal: Vector3, velocity: Vector3, spin: Vector3
+) -> tuple[Vector3, Vector3]:
     """Velocity and spin of a ball whose slip has died out. What is left of it, rounding or the tolerance of a step, is
     stopped, and the angular momentum about the contact stays."""
-    share = ratio(ball.inertia_ratio, plus(1.0, ball.inertia_ratio))
-    velocity = subtract(velocity, scale(share, own_slip(ball, normal, velocity, spin)))
-    return velocity, rolling_spin(ball, normal, velocity, spin)
+    share = ratio(inertia_ratio, plus(1.0, inertia_ratio))
+    velocity = subtract(velocity, scale(share, own_slip(radius, normal, velocity, spin)))
+    return velocity, rolling_spin(radius, normal, velocity, spin)
 
 
 def against_rough(
-    ball: Ball, normal: Vector3, wall: Vector3, mu: Number, velocity: Vector3, spin: Vector3
+    radius: Number,
+    inertia_ratio: Number,
+    normal: Vector3,
+    wall: Vector3,
+    mu: Number,
+    velocity: Vector3,
+    spin: Vector3,
 ) -> tuple[Vector3, Vector3]:
     """A rolling ball that stays on its support hits another surface. With c = n x n', d = n - n', the one motion that
     both contacts allow is v = r c, omega = d: v+ = -mu v + (1 + mu) times its projection on that (4.2), Theorem 5.1."""
     c, d = cross(normal, wall), subtract(normal, wall)
-    weight = times(ball.inertia_ratio, ball.radius)
+    weight = times(inertia_ratio, radius)
     both = plus(dot(c, velocity), times(weight, dot(d, spin)))
-    share = ratio(times(plus(1.0, mu), both), plus(dot(c, c), times(ball.inertia_ratio, dot(d, d))))
+    share = ratio(times(plus(1.0, mu), both), plus(dot(c, c), times(inertia_ratio, dot(d, d))))
     kept: Any = scale(times(-1.0, mu), velocity), scale(times(-1.0, mu), spin)
-    return add(kept[0], scale(share, c)), add(kept[1], scale(ratio(share, ball.radius), d))
+    return add(kept[0], scale(share, c)), add(kept[1], scale(ratio(share, radius), d))
 
 
 def against_smooth(normal: Vector3, wall: Vector3, mu: Number, velocity: Vector3) -> Vector3:

@@ -159,7 +159,8 @@ class Scene(AbstractSystem):
             surfaces = [self.surfaces[i] for i in alike]
             laws, normals = [each.law for each in surfaces], [each.direction(state.position, time) for each in surfaces]
             mu = select(contact, [surface.law.restitution for surface in self.surfaces])
-            velocity, spin = collide_with_all(self.ball, laws, normals, hits, mu, state.velocity, state.spin)
+            radius, alpha = self.ball.radius, self.ball.inertia_ratio
+            velocity, spin = collide_with_all(radius, alpha, laws, normals, hits, mu, state.velocity, state.spin)
             return as_arrays(state._replace(velocity=velocity, spin=spin))
 
         as_arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=time.dtype), tree)  # noqa: E731

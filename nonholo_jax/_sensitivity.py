@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._ensemble import Ensemble
-from ._measure import flat, quantities_of
+from ._measure import quantities_of
 from ._motion import AbstractMotion
 from ._sampler import Sampler, halves, uniforms
 from ._scene import Scene
 from ._simulate import checked, simulate
 from ._tiles import by_tiles
+from ._trajectory import flat
 from ._types import surfaces_hit
 
 _CHUNK = 4096

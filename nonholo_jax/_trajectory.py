@@ -1,6 +1,7 @@
 """What a simulation returns."""
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -179,3 +180,10 @@ def _rate(system: AbstractSystem, time: Any, state: Any) -> Any:
     """dq/dt of one state."""
     rate, _ = system.derivative(time, state, *system.evolving(state))
     return jnp.stack([jnp.asarray(x, dtype=time.dtype) for x in rate])
+
+
+def flat(measures: Iterable[Any], trajectory: Trajectory) -> Float[Array, " q"]:
+    """All that is measured of one trajectory."""
+    dtype = trajectory.t1.dtype
+    parts = [jnp.ravel(jnp.asarray(measure(trajectory)).astype(dtype)) for measure in measures]
+    return jnp.concatenate(parts) if parts else jnp.zeros((0,), dtype)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ._ball import BallState
 from ._motion import AbstractMotion, Exact
-from ._motion_integrated import Integrated, _rms
+from ._motion_integrated import Integrated, rms
 from ._simulate import simulate_batch
 from ._types import is_success
 
@@ -40,7 +40,7 @@ class Way(NamedTuple):
         if self.steps == "fixed":
             control = diffrax.ConstantStepSize()
             return Integrated(self.solver, stepsize_controller=control, dt0=rung, max_steps=max_steps)
-        control = diffrax.PIDController(rtol=rung, atol=rung, dtmax=longest, norm=_rms)
+        control = diffrax.PIDController(rtol=rung, atol=rung, dtmax=longest, norm=rms)
         return Integrated(self.solver, stepsize_controller=control, max_steps=max_steps)
 
 
