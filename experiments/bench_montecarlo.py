@@ -25,7 +25,7 @@ def measure(n: int, runs: int) -> None:
     from throughput_shared import by_turns
 
     from nonholo_jax import monte_carlo, simulate_batch
-    from nonholo_jax._sampler import halves, uniforms
+    from nonholo_jax._ensembles.sampler import halves, uniforms
     from nonholo_jax.scene_file import load_scene
 
     for name in SCENES:

@@ -39,7 +39,12 @@ jax.config.update("jax_enable_x64", True)
 BALL, T1, G = Ball(radius=0.025, mass=0.046), 1.5, 9.81
 UP = (0.0, 0.0, 1.0)
 # Which file of the library stands for an ingredient: its code must not be in the program of a scene without it.
-CODE = {"integrator": "_motion_integrated.py", "quaternion": "_rotation.py", "table": "_box.py", "air": "_air.py"}
+CODE = {
+    "integrator": "_motion/integrated.py",
+    "quaternion": "_math/rotation.py",
+    "table": "_world/box.py",
+    "air": "_world/air.py",
+}
 
 
 def throws(n: int, orientation: bool = False) -> BallState:

@@ -10,7 +10,7 @@ from extremes_throws import OK, SLABS, Cell, Throw, nearest, run_slab, slab_outp
 from extremes_truth import exact, slab_long, slopes, spread, values
 
 from nonholo_jax import BallState, Rough, simulate
-from nonholo_jax._types import NAMES_OF_RESULTS
+from nonholo_jax._math.types import NAMES_OF_RESULTS
 
 MILLION = 1_000_000
 _PER_IMPACT = 2.0  # roundings; they may all have one sign, as the law is the same number at every impact

@@ -9,7 +9,7 @@ import numpy as np
 from extremes_truth import CONVEX, ROUNDINGS, SLAB, box, exact, slab, slopes, sphere, spread, values
 
 from nonholo_jax import Ball, BallState, Box, Plane, Rough, Scene, Sphere, simulate
-from nonholo_jax._types import NAMES_OF_RESULTS
+from nonholo_jax._math.types import NAMES_OF_RESULTS
 
 DTYPES = (np.float32, np.float64)
 COLUMNS = tuple(f"{np.dtype(dtype)} {what}" for dtype in DTYPES for what in ("value", "gradient"))

@@ -24,7 +24,7 @@ from nonholo_jax import (
     Sphere,
     simulate,
 )
-from nonholo_jax._types import NAMES_OF_RESULTS
+from nonholo_jax._math.types import NAMES_OF_RESULTS
 
 ROWS = 24  # impacts of a throw at most, all of them in its log
 OPTIONS: dict = {}  # of the compiler

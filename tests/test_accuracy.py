@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nonholo_jax import Air, Ball, BallState, Exact, Integrated, Plane, Rough, Scene, simulate, simulate_batch
-from nonholo_jax._accuracy import motion_for
+from nonholo_jax._motion.accuracy import motion_for
 
 FLOOR = {"floor": Plane((0, 0, 0), (0, 0, 1), Rough(0.9, 0.5))}
 BALL = Ball(radius=0.025, mass=0.046)

@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from nonholo_jax import _tradeoff
+from nonholo_jax import _questions
 from nonholo_jax.cli import main
 
 BASE = """\
@@ -362,9 +362,9 @@ def test_design_without_an_answer_is_exit_code_3_with_an_honest_report(tmp_path,
 @pytest.fixture
 def small_tradeoff(monkeypatch):
     """Only what compiles in seconds; test_tradeoff.py has the rest."""
-    whole = _tradeoff.tradeoff
+    whole = _questions.tradeoff
     less = {"solvers": [], "dtypes": ["float64"], "gradients": False, "runs": 1}
-    monkeypatch.setattr(_tradeoff, "tradeoff", lambda *args, **how: whole(*args, **how | less))
+    monkeypatch.setattr(_questions, "tradeoff", lambda *args, **how: whole(*args, **how | less))
 
 
 def test_tradeoff_prints_one_json_object_and_writes_table_and_picture(tmp_path, capsys, small_tradeoff):

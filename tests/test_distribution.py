@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from nonholo_jax import Correlated, LogNormal, Measured, Normal, TruncatedNormal, Uniform
-from nonholo_jax._sampler import sobol, uniforms
+from nonholo_jax._ensembles.sampler import sobol, uniforms
 
 U = np.array([1e-12, 1e-6, 0.01, 0.3, 0.5, 0.7, 0.99, 1.0 - 1e-6, 1.0 - 1e-12])
 CENTER = 2.0

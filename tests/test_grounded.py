@@ -28,7 +28,7 @@ from nonholo_jax import (
     simulate,
     simulate_batch,
 )
-from nonholo_jax._types import kind_name
+from nonholo_jax._math.types import kind_name
 from nonholo_jax.scene_file import load_scene
 
 R, MASS, ALPHA, G = 0.1, 0.7, 0.4, 9.81

@@ -1,4 +1,5 @@
-"""The plan of the house: each file imports only from files above it, and none grows too long."""
+"""The plan of the house: a room imports only from rooms above it, a file only from files above it, and none grows too
+long."""
 
 import ast
 import pathlib
@@ -8,110 +9,100 @@ import pytest
 import nonholo_jax
 
 PACKAGE = pathlib.Path(nonholo_jax.__file__).parent
-# From the ground up. `_motion*` and the faces may be several files.
-ORDER = [
-    "_clock",
-    "_types",
-    "_vector",
-    "_shared",
-    "_polynomial",
-    "_rotation",
-    "_hops",
-    "_tiles",
-    "_tangents",
-    # ground: the mathematics of impact
-    "_impact",
-    "_law",
-    "_gap",
-    "_system",
-    "_checks",
-    "_lagrangian",
-    # world
-    "_ball",
-    "_surface",
-    "_box",
-    "_round",
-    "_air",
-    "_corner",
-    "_scene",
-    "_train",
-    "_rolling",
-    "_floors",
-    "_grounded",
-    # motion
-    "_crossing",
-    "_motion",
-    "_motion_integrated",
-    "_loop",
-    "_replay",
-    "_accuracy",
-    "_trajectory",
-    "_simulate",
-    # questions asked of motion
-    "_diagnostics",
-    "_names",
-    "_goal",
-    "_chart",
-    "_design",
-    "_fifty_digits",
-    "_ways",
-    "_tradeoff",
-    "_distribution",
-    "_sampler",
-    "_measure",
-    "_fit",
-    "_statistics",
-    "_store",
-    "_ensemble",
-    "_montecarlo",
-    "_sensitivity",
-    # face
-    "_schema_types",
-    "_montecarlo_schema",
-    "_scene_schema",
-    "_montecarlo_file",
-    "scene_file",
-    "_outline",
-    "_samples",
-    "_ensemble_plot",
-    "_fit_plot",
-    "plot",
-    "_tradeoff_plot",
-    "_montecarlo_verb",
-    "_report",
-    "cli",
-]
+# From the ground up, and so in each room.
+ROOMS = {
+    "_math": ["types", "vector", "shared", "polynomial", "gap", "rotation", "tiles", "tangents"],
+    "_impact": ["projector", "law", "corner", "train", "rolling"],
+    "_world": [
+        "hops",
+        "system",
+        "checks",
+        "ball",
+        "surface",
+        "box",
+        "round",
+        "air",
+        "scene",
+        "floors",
+        "grounded",
+        "lagrangian",
+    ],
+    "_motion": ["crossing", "motion", "integrated", "loop", "replay", "accuracy", "trajectory", "simulate"],
+    "_questions": ["diagnostics", "names", "goal", "chart", "design", "fit", "fifty_digits", "ways", "tradeoff"],
+    "_ensembles": [
+        "distribution",
+        "sampler",
+        "measure",
+        "statistics",
+        "store",
+        "ensemble",
+        "montecarlo",
+        "sensitivity",
+    ],
+    "_files": ["schema_types", "montecarlo_schema", "scene_schema", "montecarlo_file", "scene_file"],
+    "_pictures": ["outline", "samples", "ensemble_plot", "fit_plot", "plot", "tradeoff_plot"],
+    "_cli": ["clock", "report", "montecarlo_verb", "main"],
+}
+DOORS = ["plot", "scene_file", "cli"]  # public modules, which hand on what rooms hold; so does the package itself
 FILES = sorted(PACKAGE.rglob("*.py"))
-files = pytest.mark.parametrize("file", FILES, ids=[file.stem for file in FILES])
+NAMES = {file: ".".join(file.relative_to(PACKAGE).with_suffix("").parts) for file in FILES}
+files = pytest.mark.parametrize("file", FILES, ids=list(NAMES.values()))
 
 
 def parsed(file):
     return ast.parse(file.read_text())
 
 
-def imports_of(tree):
-    """The names of the package's own modules that a file imports, anywhere in it."""
-    names = set()
-    for node in ast.walk(tree):
+def imports_of(file):
+    """(room, file) of all that a file imports from the package, anywhere in it; where it imports from a room as a
+    whole, the file is `None`."""
+    here = ("nonholo_jax", *file.relative_to(PACKAGE).parts[:-1])
+    found = set()
+    for node in ast.walk(parsed(file)):
         if isinstance(node, ast.ImportFrom):
-            module = (node.module or "").removeprefix("nonholo_jax").removeprefix(".")
-            own = node.level > 0 or (node.module or "").split(".")[0] == "nonholo_jax"
-            if own:
-                names |= {module.split(".")[0]} if module else {alias.name for alias in node.names}
+            start = here[: len(here) - node.level + 1] if node.level else ()
+            module = (*start, *(node.module.split(".") if node.module else ()))
+            wholes = [(*module, alias.name) for alias in node.names]
         elif isinstance(node, ast.Import):
-            whole = [alias.name.split(".") for alias in node.names]
-            names |= {parts[1] for parts in whole if parts[0] == "nonholo_jax" and len(parts) > 1}
-    return names
+            wholes = [tuple(alias.name.split(".")) for alias in node.names]
+        else:
+            continue
+        for package, *path in wholes:
+            if package != "nonholo_jax":
+                continue
+            assert path, f"{NAMES[file]} imports the package as a whole"
+            inside = len(path) > 1 and path[1] in ROOMS.get(path[0], ())
+            found.add((path[0], path[1] if inside else None))
+    return found
+
+
+def test_every_file_has_its_place():
+    rooms = {f"{room}.{name}" for room, names in ROOMS.items() for name in [*names, "__init__"]}
+    assert set(NAMES.values()) == rooms | {"__init__", *DOORS}
+
+
+def test_no_room_is_too_full():
+    assert max(map(len, ROOMS.values())) <= 12
 
 
 @files
 def test_imports_only_from_above(file):
-    if file.stem in ("__init__", "__main__"):
+    room, _, name = NAMES[file].rpartition(".")
+    if not room:
+        below = {f"{one}.{two}" for one, two in imports_of(file) if one not in ROOMS}
+        assert not below or name == "__init__", f"{file.name} imports from {sorted(below)}"
         return
-    assert file.stem in ORDER, f"{file.name} has no place in the order of this test"
-    above = ORDER[: ORDER.index(file.stem)]
-    below = {name for name in imports_of(parsed(file)) if name in ORDER and name not in above}
-    assert not below, f"{file.name} imports from below: {sorted(below)}"
+    rooms, order = list(ROOMS), ROOMS[room]
+    above = order if name == "__init__" else order[: order.index(name)]
+    for one, two in imports_of(file):
+        fine = two in above if one == room else one in rooms[: rooms.index(room)]
+        assert fine, f"{NAMES[file]} imports from below: {one}.{two}"
+
+
+@pytest.mark.parametrize("file", [PACKAGE / "__init__.py", *(PACKAGE / f"{name}.py" for name in DOORS)])
+def test_doors_only_hand_on(file):
+    document, *rest = parsed(file).body
+    assert isinstance(document, ast.Expr) and all(isinstance(node, ast.ImportFrom) for node in rest)
 
 
 @files
@@ -124,7 +115,7 @@ def test_no_file_and_no_function_is_too_long(file):
 
 @files
 def test_configuration_is_left_to_the_command_line(file):
-    if file.stem == "cli":
+    if NAMES[file] == "_cli.main":
         return
     updates = [
         node

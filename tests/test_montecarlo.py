@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import nonholo_jax._store as store
+import nonholo_jax._ensembles.store as store
 from nonholo_jax import (
     Air,
     Ball,
@@ -42,8 +42,8 @@ from nonholo_jax import (
     monte_carlo,
     simulate,
 )
-from nonholo_jax._measure import struck
-from nonholo_jax._montecarlo import _spelled
+from nonholo_jax._ensembles.measure import struck
+from nonholo_jax._ensembles.montecarlo import _spelled
 from nonholo_jax.plot import plot_ensemble
 
 G, T1 = 9.81, 1.2

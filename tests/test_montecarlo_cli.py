@@ -197,7 +197,7 @@ def test_folders_of_others_damage_and_full_disks(scene, tmp_path, capsys, monkey
 
 
 def test_an_interrupt_ends_with_what_was_done(scene, capsys, monkeypatch):
-    import nonholo_jax._montecarlo as engine
+    import nonholo_jax._ensembles.montecarlo as engine
 
     reduce, count = engine._Runner._reduce, iter(range(10))
 

@@ -26,7 +26,7 @@ from nonholo_jax import (
     simulate,
     simulate_batch,
 )
-from nonholo_jax._types import result_name
+from nonholo_jax._math.types import result_name
 
 EPS = np.finfo(np.float64).eps
 R = 0.1

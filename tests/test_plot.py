@@ -22,7 +22,7 @@ from nonholo_jax import (
     Sphere,
     simulate,
 )
-from nonholo_jax._outline import View, axis_name, shapes
+from nonholo_jax._pictures.outline import View, axis_name, shapes
 from nonholo_jax.plot import plot_trajectory
 
 GRIP = Rough(0.85, 0.4)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholo_jax._shared import shared
+from nonholo_jax._math.shared import shared
 
 dtypes = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 

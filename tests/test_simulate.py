@@ -32,7 +32,7 @@ from nonholo_jax import (
     simulate,
     simulate_batch,
 )
-from nonholo_jax._vector import components, unit
+from nonholo_jax._math.vector import components, unit
 
 R = 0.125
 UP = (0.0, 0.0, 1.0)

@@ -25,7 +25,7 @@ from nonholo_jax import (
     simulate,
     slip,
 )
-from nonholo_jax._types import kind_name
+from nonholo_jax._math.types import kind_name
 
 R, MASS, ALPHA, G = 0.1, 0.7, 0.4, 9.81
 BALL = Ball(R, MASS, ALPHA)

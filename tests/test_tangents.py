@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholo_jax._tangents import Iteration, tangent_of
+from nonholo_jax._math.tangents import Iteration, tangent_of
 
 MOST = 20
 

@@ -12,7 +12,7 @@ import pytest
 from helpers import all_surfaces, scene_of, stacked, throws
 
 from nonholo_jax import Exact, Rough, simulate, simulate_batch
-from nonholo_jax._tiles import in_tiles
+from nonholo_jax._math.tiles import in_tiles
 
 PLANE = all_surfaces[0]
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nonholo_jax import Air, Ball, BallState, Frictional, Plane, Rough, Scene, Smooth, simulate_batch, tradeoff
-from nonholo_jax._fifty_digits import bounced, why_not
+from nonholo_jax._questions.fifty_digits import bounced, why_not
 
 BALL = Ball(radius=0.025, mass=0.046)
 FLOOR = Plane((0, 0, 0), (0, 0, 1), Rough(0.9, 0.5))

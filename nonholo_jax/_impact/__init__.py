@@ -1,0 +1,17 @@
+"""What an impact does to velocities: the projector, contact laws, corners, trains of bounces, rolling and sliding."""
+
+from . import rolling as rolling, train as train
+from .corner import collide_with_all as collide_with_all, is_one_mu as is_one_mu
+from .law import AbstractContactLaw as AbstractContactLaw, Frictional as Frictional, Rough as Rough, Smooth as Smooth
+from .projector import (
+    accelerate as accelerate,
+    collide as collide,
+    divisor as divisor,
+    matmul as matmul,
+    projector as projector,
+    pseudo_inverse as pseudo_inverse,
+    settle as settle,
+    whiten as whiten,
+)
+from .rolling import along_surface as along_surface
+from .train import Contact as Contact

@@ -1,0 +1,110 @@
+"""A ball on a flat surface: it rolls, or slides against Coulomb friction f until it rolls, and meets other surfaces.
+
+With the slip u = v_t - r omega x n, gravity g_t along the surface and g_n into it, friction accelerates the centre by
+-f g_n u/|u| and leaves v_t + alpha r (omega x n), the angular momentum about the contact, alone. So
+du/dt = g_t - F u/|u| with F = f g_n (1 + 1/alpha): on a level plane the slip decays along itself, at F, and the centre
+slows down by f g_n. A ball without slip rolls where |g_t| <= F, that is f >= tan(theta) alpha / (1 + alpha); on a
+steeper slope it begins to slide downhill.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from .._math import Number, Vector3, add, cross, dot, norm, plus, ratio, scale, subtract, times, where_number
+
+NONE: Vector3 = (0.0, 0.0, 0.0)
+
+
+def along_surface(normal: Vector3, a: Vector3) -> Vector3:
+    """The part of a vector along a surface."""
+    return subtract(a, scale(dot(a, normal), normal))
+
+
+def rolling_spin(radius: Number, normal: Vector3, turning: Vector3, spin: Vector3) -> Vector3:
+    """The spin of a ball that rolls at the velocity `turning` (less its slip, if it slips): (1.1) solved for the part
+    along the surface. The part about the normal stays."""
+    return add(scale(ratio(1.0, radius), cross(normal, turning)), scale(dot(normal, spin), normal))
+
+
+def own_slip(radius: Number, normal: Vector3, velocity: Vector3, spin: Vector3) -> Vector3:
+    """The velocity of the contact point along the surface; exactly zero where that is its rounding error."""
+    tangential = along_surface(normal, velocity)
+    slip = subtract(tangential, scale(radius, cross(spin, normal)))
+    eps = float(jnp.finfo(jnp.result_type(*velocity)).eps)
+    slips = norm(slip) > 64.0 * eps * (norm(tangential) + radius * norm(spin))
+    return tuple(where_number(slips, u, 0.0) for u in slip)  # pyright: ignore
+
+
+def heading(slip: Vector3, along: Vector3, most: Number) -> Vector3:
+    """The direction against which friction acts: that of the slip, or, where gravity overcomes the friction of a ball
+    that does not slip yet, of gravity. Zero for a ball that rolls. `most` is F."""
+    slips = norm(slip) > 0
+    slides = slips | (norm(along) > most)
+    towards = tuple(jnp.where(slips, u, g) for u, g in zip(slip, along, strict=True))
+    size = norm(towards)
+    return tuple(jnp.where(slides, ratio(x, size), 0.0) for x in towards)  # pyright: ignore
+
+
+def later_heading(slip: Vector3, known: Vector3) -> Vector3:
+    """The direction of a slip within an arc that began with a `known` one. Beyond the end of the slip, which the arc
+    will be cut at, the slip is mirrored there: a straight slide stays smooth, so that a solver may step over its end,
+    and one that turns does not, so that it may not."""
+    ahead = dot(known, slip)
+    mirrored = add(slip, scale(jnp.where(ahead < 0, -2.0, 0.0) * ahead, known))
+    size = norm(mirrored)
+    return tuple(jnp.where(size > 0, ratio(u, size), k) for u, k in zip(mirrored, known, strict=True))  # pyright: ignore
+
+
+def is_straight(known: Vector3, along: Vector3, pull: Number) -> Any:
+    """Whether gravity along the surface leaves the direction of the slip as it is."""
+    eps = float(jnp.finfo(jnp.result_type(*known)).eps)
+    return (dot(known, known) == 0) | (_sideways(known, along) <= 64.0 * eps * abs(pull))
+
+
+def stays_straight(known: Vector3, slip: Vector3, along: Vector3, most: Number, tolerance: float) -> Any:
+    """Whether the end of the slip is so near that its direction may be kept, for a velocity of 100 `tolerance` and a
+    way of `tolerance` (m/s and m). The direction settles at the rate |g_t| / |u|, which is faster than any explicit
+    solver can follow: where friction hardly exceeds gravity, it would not come to the end without this."""
+    decay, speed = most - dot(known, along), norm(slip)
+    aside = ratio(speed * _sideways(known, along), norm(along))
+    return (decay > 0) & (aside <= 100.0 * tolerance) & (aside * speed <= tolerance * decay)
+
+
+def _sideways(known: Vector3, along: Vector3) -> Number:
+    return norm(subtract(along, scale(dot(known, along), known)))
+
+
+def gripped(
+    radius: Number, inertia_ratio: Number, normal: Vector3, velocity: Vector3, spin: Vector3
+) -> tuple[Vector3, Vector3]:
+    """Velocity and spin of a ball whose slip has died out. What is left of it, rounding or the tolerance of a step, is
+    stopped, and the angular momentum about the contact stays."""
+    share = ratio(inertia_ratio, plus(1.0, inertia_ratio))
+    velocity = subtract(velocity, scale(share, own_slip(radius, normal, velocity, spin)))
+    return velocity, rolling_spin(radius, normal, velocity, spin)
+
+
+def against_rough(
+    radius: Number,
+    inertia_ratio: Number,
+    normal: Vector3,
+    wall: Vector3,
+    mu: Number,
+    velocity: Vector3,
+    spin: Vector3,
+) -> tuple[Vector3, Vector3]:
+    """A rolling ball that stays on its support hits another surface. With c = n x n', d = n - n', the one motion that
+    both contacts allow is v = r c, omega = d: v+ = -mu v + (1 + mu) times its projection on that (4.2), Theorem 5.1."""
+    c, d = cross(normal, wall), subtract(normal, wall)
+    weight = times(inertia_ratio, radius)
+    both = plus(dot(c, velocity), times(weight, dot(d, spin)))
+    share = ratio(times(plus(1.0, mu), both), plus(dot(c, c), times(inertia_ratio, dot(d, d))))
+    kept: Any = scale(times(-1.0, mu), velocity), scale(times(-1.0, mu), spin)
+    return add(kept[0], scale(share, c)), add(kept[1], scale(ratio(share, radius), d))
+
+
+def against_smooth(normal: Vector3, wall: Vector3, mu: Number, velocity: Vector3) -> Vector3:
+    """The velocity of a ball that stays on its support when it hits a smooth surface."""
+    into = along_surface(normal, wall)
+    return subtract(velocity, scale(ratio(times(plus(1.0, mu), dot(into, velocity)), dot(into, into)), into))

@@ -1,0 +1,182 @@
+"""Arithmetic on triples of scalars that drops what is known to be zero or one when the program is traced."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .types import Number, Numbers, Vector3
+
+
+def is_constant(x: Any) -> bool:
+    """True for a Python number, which is a constant of the compiled program."""
+    return isinstance(x, float | int)
+
+
+def as_number(x: Any) -> Any:
+    """A Python float for Python and NumPy numbers; JAX arrays stay as they are (integers become floating)."""
+    if isinstance(x, jax.Array):
+        return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
+    if isinstance(x, float | int | np.ndarray | np.generic) and not isinstance(x, bool):
+        return float(x)
+    if isinstance(x, str | bool | list | tuple):
+        raise ValueError(f"A number must be a float or a scalar JAX array, but got {x!r}; try 1.0.")
+    return x  # a placeholder of a pytree transformation
+
+
+def as_vector(x: Any, n: int = 3) -> Any:
+    """A tuple of n floats for Python and NumPy vectors; a JAX array with last axis n stays as it is."""
+    wrong = f"A vector must have {n} components here, but got {x!r}; try {(0.0,) * (n - 1) + (1.0,)}."
+    if isinstance(x, jax.Array):
+        if x.ndim == 0 or x.shape[-1] != n:
+            raise ValueError(wrong)
+        return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
+    if isinstance(x, list | tuple | np.ndarray):
+        if len(x) != n:
+            raise ValueError(wrong)
+        return tuple(as_number(item) for item in x)
+    if isinstance(x, float | int | str):
+        raise ValueError(wrong)
+    return x
+
+
+def as_pair(x: Any) -> Any:
+    """`as_vector` of two components."""
+    return as_vector(x, 2)
+
+
+def as_quaternion(x: Any) -> Any:
+    """`as_vector` of four components."""
+    return as_vector(x, 4)
+
+
+def components(x: Any) -> tuple:
+    """The scalars of a vector that `as_vector` stored."""
+    return x if isinstance(x, tuple) else tuple(x[..., i] for i in range(x.shape[-1]))
+
+
+def pack(x: Sequence, like: Any) -> Float[Array, " n"]:
+    """One array of the dtype of `like` from scalars."""
+    return jnp.stack([jnp.asarray(item, dtype=like.dtype) for item in x], axis=-1)
+
+
+def times(a: Numbers, b: Numbers) -> Numbers:
+    for x, y in ((a, b), (b, a)):
+        if is_constant(x):
+            if x == 0:
+                return 0.0
+            if x == 1:
+                return y
+            if x == -1:
+                return -y
+    return a * b
+
+
+def plus(a: Numbers, b: Numbers) -> Numbers:
+    if is_constant(a) and a == 0:
+        return b
+    if is_constant(b) and b == 0:
+        return a
+    return a + b
+
+
+def total(terms: Sequence[Numbers]) -> Numbers:
+    result: Numbers = 0.0
+    for term in terms:
+        result = plus(result, term)
+    return result
+
+
+def add(a: Sequence, b: Sequence) -> Any:
+    return tuple(plus(x, y) for x, y in zip(a, b, strict=True))
+
+
+def subtract(a: Sequence, b: Sequence) -> Any:
+    return tuple(plus(x, times(-1.0, y)) for x, y in zip(a, b, strict=True))
+
+
+def scale(factor: Number, a: Sequence) -> Any:
+    return tuple(times(factor, x) for x in a)
+
+
+def dot(a: Sequence, b: Sequence) -> Number:
+    return total([times(x, y) for x, y in zip(a, b, strict=True)])
+
+
+def cross(a: Vector3, b: Vector3) -> Vector3:
+    return (
+        plus(times(a[1], b[2]), times(-1.0, times(a[2], b[1]))),
+        plus(times(a[2], b[0]), times(-1.0, times(a[0], b[2]))),
+        plus(times(a[0], b[1]), times(-1.0, times(a[1], b[0]))),
+    )
+
+
+def where_number(condition: Any, a: Number, b: Number) -> Number:
+    """`jnp.where` that keeps a constant when both branches are the same one."""
+    if is_constant(a) and is_constant(b) and a == b:
+        return a
+    return jnp.where(condition, a, b)
+
+
+def minimum(a: Number, b: Number) -> Number:
+    return min(a, b) if is_constant(a) and is_constant(b) else jnp.minimum(a, b)
+
+
+def maximum(a: Number, b: Number) -> Number:
+    return max(a, b) if is_constant(a) and is_constant(b) else jnp.maximum(a, b)
+
+
+def root(x: Number) -> Number:
+    """Square root, zero for x <= 0, with a zero (not infinite) derivative there."""
+    if is_constant(x):
+        return math.sqrt(max(x, 0.0))
+    positive = x > 0
+    # The double where: the inner one keeps 1/(2 sqrt(0)) = inf out of the derivative, where inf * 0 would be NaN.
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def ratio(a: Number, b: Number, otherwise: Number = 0.0) -> Number:
+    """a / b, and `otherwise` where b is zero, with finite derivatives everywhere."""
+    if is_constant(b):
+        return times(a, 1.0 / b) if b != 0 else otherwise
+    usable = b != 0
+    return jnp.where(usable, a / jnp.where(usable, b, 1.0), otherwise)
+
+
+def norm(a: Sequence) -> Number:
+    return root(dot(a, a))
+
+
+def unit(a: Sequence) -> Any:
+    """The direction of a vector; exact for the axes."""
+    length = norm(a)
+    return tuple(a) if is_constant(length) and length == 1 else tuple(ratio(x, length) for x in a)
+
+
+def select(index: Any, options: Sequence[Number]) -> Number:
+    """options[index] for a traced index, folded where all options are the same constant."""
+    result = options[-1]
+    for i in range(len(options) - 2, -1, -1):
+        result = where_number(index == i, options[i], result)
+    return result
+
+
+def select_vector(index: Any, options: Sequence[Vector3]) -> Any:
+    return tuple(select(index, [option[axis] for option in options]) for axis in range(3))
+
+
+def slope(function: Callable, at: Sequence, along: Sequence) -> tuple[Number, Number]:
+    """A scalar function of a point and its derivative along a direction."""
+    dtype = jnp.result_type(*[x for x in (*at, *along) if not is_constant(x)] or [float])
+    lift = lambda xs: tuple(jnp.asarray(x, dtype=dtype) for x in xs)  # noqa: E731
+    value, derivative = jax.jvp(lambda *x: jnp.asarray(function(x), dtype=dtype), lift(at), lift(along))
+    return value, derivative
+
+
+def frozen(tree: Any) -> Any:
+    """The same values without derivatives; constants stay constants."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if isinstance(x, jax.Array) else x, tree)

@@ -1,0 +1,293 @@
+"""Motion by any explicit Diffrax solver, one step an arc, with the solver's own interpolant."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._math import Scalar, frozen, plus, root, shared, times, total
+from .crossing import Arc
+from .motion import AbstractMotion, Piece, check_counts
+
+
+def rms(tree: Any) -> Any:
+    """The root mean square of scalars, without first gathering them into one array."""
+    leaves = jax.tree.leaves(tree)
+    return root(total([x * x for x in leaves]) / len(leaves))
+
+
+class _Control(NamedTuple):
+    size: Scalar
+    controller: Any
+
+
+class Integrated(AbstractMotion):
+    """Motion by an explicit solver of Diffrax, for scenes with air and for systems without closed form.
+
+    **Arguments:**
+
+    - `solver`: an explicit solver of `diffrax` for ordinary differential equations. Explicit Runge-Kutta solvers run
+        on their own tableau and interpolant, unrolled over scalars; others through their `init` and `step`.
+    - `stepsize_controller`: `None` for `diffrax.PIDController(rtol, atol)`; a `PIDController` of your own; or
+        `diffrax.ConstantStepSize()` with `dt0`.
+    - `rtol`, `atol`: relative and absolute tolerance of one step.
+    - `dt0`: first step in s, or `None` to have it chosen.
+    - `max_steps`: bound on the number of accepted steps (arcs, each cut short by an impact included), after which the
+        result is `step_limit`.
+    - `safe_steps`, `tile`: speed only. How often one turn of the event loop may look ahead for a crossing, and how many
+        lanes of a batch share one loop on a CPU.
+
+    Raises `ValueError` for a solver that is not explicit, or a controller of another class.
+
+    ```python
+    import diffrax
+    from nonholo_jax import Integrated
+    motion = Integrated(solver=diffrax.Dopri5(), rtol=1e-6, atol=1e-6)
+    ```
+    """
+
+    solver: diffrax.AbstractSolver = diffrax.Tsit5()
+    stepsize_controller: Any = None
+    rtol: float = eqx.field(static=True, default=1e-8)
+    atol: float = eqx.field(static=True, default=1e-8)
+    dt0: Any = None
+    max_steps: int = eqx.field(static=True, default=4096)
+    safe_steps: int = eqx.field(static=True, default=3)
+    tile: int = eqx.field(static=True, default=64)
+    is_closed_form: ClassVar[bool] = False
+
+    def __check_init__(self):
+        explicit = isinstance(self.solver, diffrax.AbstractERK) or not isinstance(
+            self.solver, diffrax.AbstractImplicitSolver | diffrax.AbstractWrappedSolver | diffrax.AbstractSRK
+        )
+        if not explicit or self.solver.term_structure is not diffrax.AbstractTerm:
+            raise ValueError(
+                f"Argument `solver` must be an explicit Diffrax solver of one term, but got {self.solver}; try "
+                "diffrax.Tsit5()."
+            )
+        known = (type(None), diffrax.PIDController, diffrax.ConstantStepSize)
+        if not isinstance(self.stepsize_controller, known):
+            raise ValueError(
+                "Argument `stepsize_controller` must be None, a diffrax.PIDController or diffrax.ConstantStepSize(), "
+                f"but got {self.stepsize_controller}; try None with `rtol` and `atol`."
+            )
+        if self._is_constant and self.dt0 is None:
+            raise ValueError("Argument `dt0` must be given with constant steps, but got None; try dt0=1e-3.")
+        check_counts(max_steps=self.max_steps, safe_steps=self.safe_steps, tile=self.tile)
+
+    @property
+    def _is_constant(self) -> bool:
+        if self.stepsize_controller is None:  # a solver without error estimate can only take constant steps
+            return not isinstance(self.solver, diffrax.AbstractAdaptiveSolver) or _has_no_estimate(self.solver)
+        return isinstance(self.stepsize_controller, diffrax.ConstantStepSize)
+
+    @property
+    def _controller(self) -> Any:
+        if self.stepsize_controller is None:
+            return diffrax.PIDController(rtol=self.rtol, atol=self.atol, norm=rms)
+        return self.stepsize_controller
+
+    def check(self, system):
+        del system
+
+    def max_pieces(self, max_impacts):
+        return self.max_steps
+
+    def max_turns(self, max_impacts):
+        # Generous, for `max_steps` counts arcs: rejected steps, and further search along an arc, take turns but no arc.
+        return 16 * (self.max_steps + 16)
+
+    def begin(self, system, time, state, t1):
+        term, z = _term(system, state), system.evolving(state)
+        memory = None
+        if not isinstance(self.solver, diffrax.AbstractERK):
+            memory = self.solver.init(term, time, t1, _arrays(z, time), None)
+        if self._is_constant:
+            return _Control(jnp.asarray(self.dt0, dtype=time.dtype), None), memory
+        dt0 = None if self.dt0 is None else jnp.asarray(self.dt0, dtype=time.dtype)
+        func = lambda terms, t, y, args: terms.vf(t, y, args)  # noqa: E731
+        order = self.solver.error_order(term)
+        zero = jnp.zeros_like(time)
+        controller, init = frozen(self._controller), frozen((_arrays(z, time), t1 - time))
+        still = _term(frozen(system), frozen(state))
+        size, memo = controller.init(still, zero, init[1], init[0], dt0, None, func, order)
+        return _Control(frozen(jnp.asarray(size, dtype=time.dtype)), jax.tree.map(jnp.asarray, memo)), memory
+
+    def size(self, control, left):
+        return jnp.minimum(control.size, left)
+
+    def piece(self, system, time, state, memory, jumped, size):
+        if isinstance(self.solver, diffrax.AbstractERK):
+            return _runge_kutta_step(self.solver, system, time, state, size)
+        z0 = _arrays(system.evolving(state), time)
+        z1, error, info, memory, _ = self.solver.step(_term(system, state), time, time + size, z0, None, memory, jumped)
+        path = self.solver.interpolation_cls(t0=time, t1=time + size, **info)
+        arc = _fitted_arc(path, z0, time, state, size)
+        return Piece(arc, memory, (z0, z1, error))
+
+    def judge(self, control, size, trial):
+        z0, z1, error = frozen(trial)
+        if self._is_constant:
+            return jnp.asarray(True), control
+        zero = jnp.zeros_like(size)
+        order = self.solver.error_order(_term(None, None))
+        keep, t0, t1, _, memo, _ = frozen(self._controller).adapt_step_size(
+            zero, size, z0, z1, None, error, order, control.controller
+        )
+        # A rejected step shrinks; a step cut short by t1 must not make the next one small, but there is none.
+        return keep, _Control(t1 - t0, memo)
+
+
+def _has_no_estimate(solver: Any) -> bool:
+    return isinstance(solver, diffrax.AbstractERK) and not np.any(getattr(solver.tableau, "b_error", 1.0))
+
+
+def _arrays(z: Any, like: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype=like.dtype), z)
+
+
+def _term(system: Any, state: Any) -> diffrax.ODETerm:
+    def field(t, z, args):
+        q, v = z
+        return _arrays(system.derivative(t, state, q, v), t)
+
+    return diffrax.ODETerm(field)
+
+
+def _combination(weights: Any, terms: Sequence) -> Any:
+    return total([times(float(w), term) for w, term in zip(weights, terms, strict=False)])
+
+
+def _unrolled_stages(tableau: Any, system: Any, time: Any, state: Any, h: Any) -> tuple[list, list]:
+    """The stages of an explicit Runge-Kutta method over scalars: h times the derivative of (q, v), flat; the part of q
+    itself."""
+    q, v = system.evolving(state)
+    n = len(q)
+    stages, rates = [], []
+    for i in range(tableau.num_stages):
+        row = tableau.a_lower[i - 1] if i > 0 else ()
+        z = [plus(x, _combination(row, [k[j] for k in stages])) for j, x in enumerate((*q, *v))]
+        c = 0.0 if i == 0 else float(tableau.c[i - 1])
+        dq, dv = system.derivative(time + c * h, state, tuple(z[:n]), tuple(z[n:]))
+        stages.append(shared([h * x for x in (*dq, *dv)]))
+        rates.append(dq)
+    return stages, rates
+
+
+def _stages_in_turn(tableau: Any, system: Any, time: Any, state: Any, h: Any) -> tuple[list, list]:
+    """The same by a loop, which holds the system's derivative once, and over two arrays, q and v: where the derivative
+    is a long program, it compiles several times as fast."""
+    (q, v), count = (_joined(x, time) for x in system.evolving(state)), tableau.num_stages
+    weights, nodes = np.zeros((count, count)), np.zeros(count)
+    for i in range(1, count):
+        weights[i, :i], nodes[i] = tableau.a_lower[i - 1], tableau.c[i - 1]
+
+    def stage(slopes, each):
+        index, row, c = each
+        z = [x + h * jnp.sum(row[:, None] * slope, axis=0) for x, slope in zip((q, v), slopes, strict=True)]
+        rates = system.derivative(time + c * h, state, *(tuple(x) for x in z))
+        return tuple(x.at[index].set(_joined(rate, time)) for x, rate in zip(slopes, rates, strict=True)), None
+
+    plan = (jnp.arange(count), jnp.asarray(weights, dtype=time.dtype), jnp.asarray(nodes, dtype=time.dtype))
+    start = tuple(jnp.zeros((count, x.size), time.dtype) for x in (q, v))
+    (rates, others), _ = jax.lax.scan(stage, start, plan)
+    return [(h * rates[i], h * others[i]) for i in range(count)], [(rates[i],) for i in range(count)]
+
+
+def _joined(x: Any, like: Any) -> Any:
+    return jnp.stack([jnp.asarray(c, dtype=like.dtype) for c in x])
+
+
+def _runge_kutta_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -> Piece:
+    """One step of an explicit Runge-Kutta method and its interpolant."""
+    tableau, (q, v) = solver.tableau, system.evolving(state)
+    make, split = _unrolled_stages, tuple
+    if system.is_long:  # the same arithmetic on two arrays instead of many scalars
+        make, split = _stages_in_turn, lambda blocks: tuple(c for block in blocks for c in block)
+        q, v = (_joined(q, time),), (_joined(v, time),)
+    n, z0 = len(q), (*q, *v)
+    stages, rates = make(tableau, system, time, state, h)
+    columns = [[k[j] for k in stages] for j in range(len(z0))]
+    steps = shared([_combination(tableau.b_sol, column) for column in columns])
+    z1 = tuple(plus(x, step) for x, step in zip(z0, steps, strict=True))
+    error = tuple(_combination(tableau.b_error, column) for column in columns)
+    weights = interpolation_weights(solver)
+    if len(weights) == 2 and not tableau.fsal:
+        means = [_combination(tableau.b_sol, column) for column in zip(*rates, strict=True)]
+        ends, _ = system.derivative(time + h, state, split(z1[:n]), split(z1[n:]))
+        ends = (_joined(ends, time),) if system.is_long else ends
+        path = tuple(_cubic(*each, h) for each in zip(q, rates[0], ends, means, strict=True))
+        rate = tuple(_quadratic(*each) for each in zip(v, stages[0][n:], z1[n:], strict=True))
+    else:
+        polynomials = []
+        for x, step, column in zip(z0, steps, columns, strict=True):
+            inner = shared([_combination(row, column) for row in weights])
+            # The last coefficient makes the polynomial end where the step ends, to rounding.
+            polynomials.append((x, *inner, plus(step, times(-1.0, total(inner)))))
+        path, rate = tuple(polynomials[:n]), tuple(polynomials[n:])
+    if system.is_long:
+        path, rate = (tuple(zip(*part[0], strict=True)) for part in (path, rate))
+    return Piece(Arc(time, state, path, rate, jnp.ones_like(h), h), None, (split(z0), split(z1), split(error)))
+
+
+def _cubic(q0: Any, rate0: Any, rate1: Any, mean: Any, h: Any) -> tuple:
+    """The path with these rates at its ends and `mean` between them. Diffrax's own cubic takes the last stage for the
+    slope at the end, which it is not where the first stage is not the last of the step before: a ball would leave the
+    floor with another velocity than it has there."""
+    second = plus(times(3.0, mean), times(-1.0, plus(times(2.0, rate0), rate1)))
+    third = plus(plus(rate0, rate1), times(-2.0, mean))
+    second, third = shared([second, third])
+    return q0, times(h, rate0), times(h, second), times(h, third)
+
+
+def _quadratic(v0: Any, step: Any, v1: Any) -> tuple:
+    """What begins at v0 with the slope `step` and ends at v1."""
+    return v0, step, plus(v1, times(-1.0, plus(v0, step)))
+
+
+def interpolation_weights(solver: Any) -> np.ndarray:
+    """The solver's interpolant as powers of theta in [0, 1]: row j - 1 holds the weights of theta^j on the stages, for
+    j from 1 to degree - 1; what theta^degree gets follows from the end of the step. Constants, found at trace time by
+    evaluating Diffrax's own interpolation class on unit stages and fitting the lowest degree that reproduces it."""
+    tableau = solver.tableau
+    n = tableau.num_stages
+    with jax.ensure_compile_time_eval():
+        path = solver.interpolation_cls(
+            t0=jnp.asarray(0.0),
+            t1=jnp.asarray(1.0),
+            y0=jnp.zeros(n),
+            y1=jnp.asarray(tableau.b_sol),
+            k=jnp.eye(n),
+        )
+        check = np.linspace(0.0, 1.0, 23)
+        values = {float(s): np.asarray(path.evaluate(jnp.asarray(s)), dtype=float) for s in check}
+        eps = float(jnp.finfo(jnp.zeros(()).dtype).eps)
+        for degree in range(1, 10):
+            nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(degree) + 1) / degree)  # 0 is known: the path starts there
+            samples = np.stack([np.asarray(path.evaluate(jnp.asarray(s)), dtype=float) for s in nodes])
+            fit = np.linalg.solve(nodes[:, None] ** np.arange(1, degree + 1), samples)
+            powers = lambda s, d=degree: s ** np.arange(1, d + 1)  # noqa: E731
+            misfit = max(np.max(np.abs(powers(s) @ fit - value)) for s, value in values.items())
+            if misfit < 1e4 * eps * max(1.0, float(np.max(np.abs(fit)))):
+                fit[np.abs(fit) < 1e2 * eps] = 0.0
+                return fit[:-1]
+    raise ValueError(f"Argument `solver` must have a polynomial interpolant, but got {solver}; try diffrax.Tsit5().")
+
+
+def _fitted_arc(path: Any, z0: Any, time: Any, state: Any, h: Any) -> Arc:
+    """An arc through samples of any interpolation class: linear for solvers that interpolate so, else quintic."""
+    degree = 1 if isinstance(path, diffrax.LocalLinearInterpolation) else 5
+    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(degree) + 1) / degree)
+    inverse = np.linalg.inv(nodes[:, None] ** np.arange(1, degree + 1))
+    samples = [path.evaluate(time + float(s) * h) for s in nodes]
+
+    def fit(start, *values):
+        rises = [value - start for value in values]
+        return (start, *[_combination(row, rises) for row in inverse])
+
+    q, v = jax.tree.map(fit, z0, *samples)
+    return Arc(time, state, q, v, jnp.ones_like(h), h)

@@ -1,0 +1,407 @@
+"""The event loop. It knows no ball: a system gives it arcs, levels and impacts over a state that is any pytree.
+
+One flat loop: a turn searches one arc for its first crossing and finishes it with an impact, or goes on with the next
+arc; lanes of a batch are each in their own bounce. Where the system knows its next impact in closed form it hops.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from .._math import KINDS, RESULTS, frozen, norm, shared
+from .._world import ENDS, FULL, PAUSES, AbstractSystem, Hopper
+from .crossing import meeting, newton, search
+from .motion import AbstractMotion
+
+_MOST_IMPACTS_AT_ONCE = 32
+_FEW_ROWS = 64
+
+
+class Row(NamedTuple):
+    """One impact, as the log keeps it."""
+
+    time: Any
+    until: Any  # when `after` holds: later than `time` if a train is summed
+    duration: Any
+    before: Any
+    after: Any
+
+
+class Log(NamedTuple):
+    """Impacts in the order in which they happen: floats packed into one buffer, one write an impact."""
+
+    values: Any
+    labels: Any  # contact, kind, and the phase that follows, or -1
+
+
+class Path(NamedTuple):
+    """What `replay` needs of every arc: its size in seconds (infinite for one that reaches as far as t1, whose size
+    has derivatives), where it was cut in local time, by which contact, and what kind of impact that was."""
+
+    sizes: Any
+    labels: Any
+
+
+class Outcome(NamedTuple):
+    """What a run returns."""
+
+    time: Any
+    state: Any
+    n_impacts: Any
+    n_arcs: Any
+    result: Any
+    log: Log
+
+
+class Carry(NamedTuple):
+    # where the motion is
+    time: Any
+    ahead: Any  # by how much rounding has put `time` ahead of the motion
+    state: Any
+    memory: Any
+    # how the present arc is searched
+    s: Any  # local time up to which no contact is crossed
+    window: Any  # how far ahead the search looks
+    touching: Any  # contact just left, or -1
+    jumped: Any  # an impact has happened since the last arc
+    control: Any
+    # what was done
+    since: Any  # seconds since the last impact
+    n_impacts: Any
+    n_arcs: Any
+    n_turns: Any
+    n_at_once: Any
+    log: Log
+    path: Path
+    # why it ended
+    done: Any
+    result: Any
+
+
+def pack_row(row: Row) -> Any:
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(row)])
+
+
+def unpack_row(values: Any, like: Any) -> Row:
+    """The rows of a log, leading axes kept; `like` is a state of the right structure."""
+    leaves, treedef = jax.tree.flatten(Row(jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), like, like))
+    rows, start = [], 0
+    for leaf in leaves:
+        stop = start + jnp.size(leaf)
+        part = values[..., start:stop]
+        rows.append(part[..., 0] if jnp.ndim(leaf) == 0 else part)
+        start = stop
+    return jax.tree.unflatten(treedef, rows)
+
+
+def as_arrays(state: Any, dtype: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype=dtype), state)
+
+
+def _empty_log(state: Any, like: Any, rows: int) -> Log:
+    width = pack_row(Row(like, like, like, state, state)).size
+    return Log(jnp.full((rows, width), jnp.nan, like.dtype), jnp.full((rows, 3), -1, jnp.int32))
+
+
+def _write(buffer: Any, index: Any, wanted: Any, value: Any) -> Any:
+    """The buffer with one more row. In a batch every lane has an index of its own; to write all rows anew, if they are
+    few, is then quicker than XLA's scatter on a CPU, from JAX 0.12 on: before, `value` is not computed once for all."""
+    rows = buffer.shape[0]
+    if rows == 0:
+        return buffer
+    if rows <= _FEW_ROWS and jax.default_backend() == "cpu" and jax.__version_info__ >= (0, 12):
+        (value,) = shared([value]) if jnp.issubdtype(value.dtype, jnp.inexact) else (value,)
+        here = jnp.arange(rows, dtype=jnp.int32) == jnp.where(wanted, index, -1)
+        return jnp.where(here[:, None], value[None], buffer)
+    return buffer.at[jnp.where(wanted, index, rows)].set(value, mode="drop")
+
+
+def _written(record: Any, index: Any, wanted: Any, *values: Any) -> Any:
+    """A log or a path with one more row."""
+    return type(record)(*[_write(buffer, index, wanted, x) for buffer, x in zip(record, values, strict=True)])
+
+
+def computed_once(state: Any) -> Any:
+    leaves, treedef = jax.tree.flatten(state)
+    return jax.tree.unflatten(treedef, shared(leaves))
+
+
+def _shared_flags(flags: tuple) -> list:
+    return [flag > 0.5 for flag in shared([flag.astype(float) for flag in flags])]
+
+
+def keep(condition: Any, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> Carry:
+    state = as_arrays(state, t0.dtype)
+    control, memory = motion.begin(system, t0, state, t1)
+    admissible = system.is_admissible(t0, state) & jnp.isfinite(t0) & jnp.isfinite(t1) & (t1 >= t0)
+    zero = jnp.asarray(0, dtype=jnp.int32)
+    return Carry(
+        time=t0,
+        ahead=jnp.zeros_like(t0),
+        state=state,
+        memory=memory,
+        s=jnp.zeros_like(t0),
+        window=jnp.full_like(t0, jnp.inf),
+        touching=zero - 1,
+        jumped=jnp.asarray(True),
+        control=control,
+        since=jnp.zeros_like(t0),
+        n_impacts=zero,
+        n_arcs=zero,
+        n_turns=zero,
+        n_at_once=zero,
+        log=_empty_log(state, t0, log_rows),
+        path=Path(jnp.zeros((path_rows, 2), t0.dtype), jnp.full((path_rows, 2), -1, jnp.int32)),
+        done=~admissible,
+        result=RESULTS.where(admissible, RESULTS.reached_t1, RESULTS.invalid_state),
+    )
+
+
+def turn(c: Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, max_impacts: int) -> Carry:
+    """One turn: search one arc a little further; where that ends it, finish it."""
+    left = t1 - c.time + c.ahead
+    size = jnp.where(c.done, 1.0, motion.size(c.control, left))  # finished lanes compute harmless numbers
+    last = size >= left
+    length = jnp.where(last, left, frozen(size))
+    begun = system.prepared(c.time, c.state)
+    piece = motion.piece(system, c.time, begun, c.memory, c.jumped, length)
+    arc = piece.arc
+    kept, control = motion.judge(c.control, size, piece.trial)
+    found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
+    kept, finished = _shared_flags((kept, found.finished))
+    ended = kept & finished
+    crossed = ended & (found.contact >= 0)
+    through = ended & ~crossed
+    s, resting, ends = jnp.where(through, arc.length, found.s), jnp.asarray(False), jnp.asarray(False)
+    if system.n_contacts > 0:
+        met = meeting(system, arc, found.s, found.contact)
+        s, resting, ends = jnp.where(crossed, newton(arc, s, met.value, met.rate, met.noise), s), met.rests, met.ends
+        (s,) = shared([s])
+    elapsed = s * arc.unit
+    reached = through & last
+    time, ahead = later(c.time, c.ahead, elapsed)
+    time = jnp.where(reached, t1, time)
+    arrived = as_arrays(system.advanced(time, begun, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
+    arrived = computed_once(arrived)
+
+    since = c.since + elapsed
+    at_once = since * norm(frozen(arc.tangent(s))) <= _tiny(arc, s) * arc.unit
+    same = found.contact == c.touching  # bounces on one surface die out, they are no corner
+    n_at_once = jnp.where(at_once & (c.n_impacts > 0) & ~same, c.n_at_once + 1, 0)
+    full = c.n_impacts >= max_impacts
+    stuck = n_at_once > _MOST_IMPACTS_AT_ONCE
+    kind, fault, after, pause, name = KINDS.unused, RESULTS.reached_t1, arrived, 0.0, found.contact
+    if system.n_contacts > 0:
+        name = system.named(found.contact, arrived)
+        bounced = system.bounced(found.contact, time, arrived)
+        kind, fault = system.follows(found.contact, time, arrived, bounced, t1 - time, resting, ends)
+        after, pause = system.impact(found.contact, time, arrived, bounced, kind)
+        after = as_arrays(after, t1.dtype)
+    failed = fault != RESULTS.reached_t1
+    stopped = crossed & (failed | full | stuck)
+    stopped, crossed = _shared_flags((stopped, crossed))
+    struck = crossed & ~stopped
+    until = time + pause
+    settled = struck & system.is_at_rest(found.contact, time, arrived, after)
+    row, labels = Row(time, until, since, arrived, after), jnp.stack([name, _code(kind), system.phase(after)])
+    log = _written(c.log, c.n_impacts, struck & ~c.done, pack_row(row), labels)
+    sizes = frozen(jnp.stack([jnp.where(last, jnp.inf, length), s]))
+    place = c.n_arcs % max(c.path.labels.shape[0], 1)
+    path = _written(c.path, place, ended & ~c.done, sizes, jnp.stack([found.contact, labels[1]]))
+
+    broken = ended & ~jnp.isfinite(time + sum(arrived_leaf.sum() for arrived_leaf in jax.tree.leaves(arrived)))
+    (broken,) = _shared_flags((broken,))
+    n_arcs = c.n_arcs + ended.astype(jnp.int32)
+    exhausted = (c.n_turns + 1 >= motion.max_turns(max_impacts)) | (n_arcs >= motion.max_pieces(max_impacts))
+    exhausted = exhausted & ~(reached | stopped | settled | broken)
+    cases = [(crossed & full, RESULTS.max_impacts), (crossed & stuck, RESULTS.corner), (crossed & failed, fault),
+             (settled, RESULTS.at_rest), (broken, RESULTS.invalid_state), (exhausted, RESULTS.step_limit)]  # fmt: skip
+    result = functools.reduce(lambda result, case: RESULTS.where(*case, result), cases, c.result)
+    new = c._replace(
+        time=jnp.where(struck, until, jnp.where(ended, time, c.time)),
+        ahead=jnp.where(ended, ahead, c.ahead),
+        state=keep(ended, keep(struck, after, arrived), c.state),
+        memory=keep(ended, piece.memory, c.memory),
+        s=jnp.where(kept & ~ended, frozen(found.s), 0.0),
+        window=jnp.where(kept & ~ended, frozen(found.window), jnp.inf),
+        touching=jnp.where(struck, name, jnp.where(through, -1, c.touching)),
+        jumped=jnp.where(ended, struck, c.jumped),
+        control=keep(ended | ~kept, control, c.control),
+        since=jnp.where(struck, 0.0, jnp.where(ended, since, c.since)),
+        n_impacts=c.n_impacts + struck.astype(jnp.int32),
+        n_arcs=n_arcs,
+        n_turns=c.n_turns + 1,
+        n_at_once=jnp.where(struck, n_at_once, c.n_at_once),
+        done=reached | stopped | settled | exhausted | broken,
+        result=result,
+    )
+    old = c._replace(log=log, path=path)
+    return _keep_small(c.done, old, new._replace(log=log, path=path))
+
+
+def _keep_small(condition: Any, a: Carry, b: Carry) -> Carry:
+    """`keep` for all but the buffers, which would be copied whole at every turn."""
+    fields = {name: keep(condition, getattr(a, name), getattr(b, name))
+              for name in Carry._fields if name not in ("log", "path")}  # fmt: skip
+    return Carry(log=a.log, path=a.path, **fields)
+
+
+def later(time: Any, ahead: Any, elapsed: Any) -> tuple[Any, Any]:
+    """The time after so many seconds, and by how much rounding has put that ahead: Kahan's sum. Bounces of one height
+    would otherwise all round it the same way, in float32 at 1e6 s by hundredths of a second each."""
+    step = elapsed - ahead
+    total = time + step
+    return total, frozen((total - time) - step)
+
+
+def _code(kind: Any) -> Any:
+    return jnp.asarray(kind._value, dtype=jnp.int32)
+
+
+def kind_of(code: Any) -> KINDS:
+    """The kind of that code."""
+    return eqx.tree_at(lambda kind: kind._value, KINDS.bounce, code)
+
+
+def _tiny(arc: Any, s: Any) -> Any:
+    """A length below which two impacts count as one instant."""
+    eps = float(jnp.finfo(s.dtype).eps)
+    return 64.0 * eps * frozen(norm(arc.position(s)))
+
+
+class _Hopping(NamedTuple):
+    """A carry without what only a search needs."""
+
+    time: Any
+    ahead: Any
+    state: Any
+    mark: Any  # the contact just left, or -1; once it has stopped, when and why, as `_stopped` has it
+    turn: Any
+    path: Any  # the choices so far, or none
+
+
+def _stopped(turn: Any, touching: Any, why: Any, bits: int) -> Any:
+    """A mark below -1 from the number of impacts, the contact last touched and the reason, 0 to 2."""
+    return ~((((turn << bits) | (touching + 1)) << 2 | why) + 1)
+
+
+def _unmarked(mark: Any, bits: int) -> tuple:
+    known = ~mark - 1
+    return known >> (bits + 2), ((known >> 2) & ((1 << bits) - 1)) - 1, known & 3
+
+
+def hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows: int = 0) -> tuple[Carry, Any]:
+    """The motion as far as it is a row of ordinary impacts, known in closed form, and the choices of the hops, in so
+    many rows."""
+    end = _hops(carry, system, t1, max_impacts, rows)
+    return _landed(carry, end, system, t1), end.path
+
+
+def _hops(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows: int = 0) -> _Hopping:
+    """All lanes that hop are at the same impact, so that the number of turns counts their impacts."""
+    bits, hopper = system.n_contacts.bit_length(), system.hopper(carry.state)
+    assert hopper is not None
+
+    def hop(c: _Hopping) -> _Hopping:
+        going, full = c.mark >= -1, c.turn >= max_impacts - carry.n_impacts
+        done = hopper.first(c.mark, going, full, t1 - c.time + c.ahead, c.state)
+        why = jnp.where(done.choice == ENDS, 0, jnp.where(done.choice <= FULL, 1, 2))
+        stop = _stopped(c.turn, jnp.maximum(c.mark, -1), why, bits)
+        mark = jnp.where(done.choice >= 0, done.choice.astype(jnp.int32), jnp.where(going, stop, c.mark))
+        time, ahead = later(c.time, c.ahead, done.duration)
+        path = c.path.at[c.turn].set(done.choice.astype(c.path.dtype)) if rows else c.path
+        return _Hopping(time, ahead, done.state, mark, c.turn + 1, path)
+
+    zero = jnp.asarray(0, dtype=jnp.int32)
+    mark = jnp.where(_can_start(carry, system), carry.touching, _stopped(zero, -1, 2, bits))
+    path = jnp.full((rows,), int(PAUSES), jnp.int16)
+    begin = _Hopping(carry.time, carry.ahead, carry.state, mark, zero, path)
+    return lax.while_loop(lambda c: eqxi.unvmap_any(c.mark >= -1), hop, begin)
+
+
+def _can_start(carry: Carry, system: AbstractSystem) -> Any:
+    return ~carry.done & (carry.s == 0) & (system.phase(carry.state) < 0)
+
+
+def _landed(carry: Carry, end: _Hopping, system: AbstractSystem, t1: Any) -> Carry:
+    """The carry after hops."""
+    free = _can_start(carry, system)
+    n_impacts, touching, why = _unmarked(end.mark, system.n_contacts.bit_length())
+    reached, full, moved = free & (why == 0), free & (why == 1), n_impacts > 0
+    return carry._replace(
+        time=jnp.where(reached, t1, end.time),
+        ahead=end.ahead,
+        state=end.state,
+        window=jnp.where(moved, jnp.inf, carry.window),
+        touching=jnp.where(free, touching, carry.touching),
+        jumped=carry.jumped | moved,
+        since=jnp.where(moved, 0.0, carry.since),
+        n_impacts=carry.n_impacts + n_impacts,
+        n_arcs=carry.n_arcs + n_impacts + (reached | full).astype(jnp.int32),
+        n_at_once=jnp.where(moved, 0, carry.n_at_once),
+        done=carry.done | reached | full,
+        result=RESULTS.where(full, RESULTS.max_impacts, carry.result),
+    )
+
+
+def hopper_of(system: AbstractSystem, motion: AbstractMotion, state: Any, max_impacts: int) -> Hopper | None:
+    """How the system hops, if it does."""
+    few = (max_impacts + 2) << (system.n_contacts.bit_length() + 2) < 2**31
+    return system.hopper(state) if motion.is_closed_form and few else None
+
+
+def _turned(c: Carry, system, motion, t1, max_impacts: int) -> Carry:
+    return hopped(turn(c, system, motion, t1, max_impacts), system, t1, max_impacts)[0]
+
+
+def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = "lax") -> Outcome:
+    """Run the loop. `kind` says how the loop itself may be differentiated: "lax" forward, "checkpointed" in reverse."""
+    carry = start(system, motion, state, t0, t1, log_rows, 0)
+    next_turn = lambda c: turn(c, system, motion, t1, max_impacts)  # noqa: E731
+    going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
+    if kind == "lax":
+        end = lax.while_loop(going, next_turn, carry)
+    else:
+        end = eqxi.while_loop(going, next_turn, carry, kind=kind, max_steps=motion.max_turns(max_impacts))
+    return _outcome(end)
+
+
+class Begun(NamedTuple):
+    """How far hops have come, beside the outcome."""
+
+    unfinished: Any
+    ahead: Any
+    mark: Any
+
+
+def begin_by_hops(system, motion, state, t0, t1, *, max_impacts: int) -> tuple[Outcome, Begun]:
+    """`find`, as far as it goes by hops. Neither this nor the rest is for derivatives."""
+    carry = start(system, motion, state, t0, t1, 0, 0)
+    end = _hops(carry, system, t1, max_impacts)
+    c = _landed(carry, end, system, t1)
+    return _outcome(c), Begun(~c.done, end.ahead, end.mark)
+
+
+def finish(outcome: Outcome, begun: Begun, system, motion, t1, *, max_impacts: int) -> Outcome:
+    """The rest, by turns, and, where hops are a short program, by both. The carry, which is long, is made again."""
+    hopper = system.hopper(outcome.state)
+    next_of = _turned if hopper is not None and hopper.again is not None else turn
+    carry = start(system, motion, outcome.state, outcome.time, t1, 0, 0)
+    nothing = jnp.zeros((0,), jnp.int16)
+    end = _Hopping(outcome.time, begun.ahead, outcome.state, begun.mark, outcome.n_impacts, nothing)
+    going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
+    next_turn = lambda c: next_of(c, system, motion, t1, max_impacts)  # noqa: E731
+    return _outcome(lax.while_loop(going, next_turn, _landed(carry, end, system, t1)))
+
+
+def _outcome(c: Carry) -> Outcome:
+    return Outcome(c.time, c.state, c.n_impacts, c.n_arcs, c.result, c.log)

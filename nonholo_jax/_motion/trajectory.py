@@ -1,0 +1,187 @@
+"""What a simulation returns."""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._math import KINDS, RESULTS, along, frozen
+from .._world import AbstractSystem
+from .loop import Outcome, kind_of, unpack_row
+from .motion import AbstractMotion
+from .replay import run
+
+
+class ImpactLog(eqx.Module):
+    """The impacts in the order in which they happened, and where a ball left an edge. Every field has the leading axis
+    log_size (behind the batch axis, if any); rows that are not used hold NaN, and -1 in `surface`.
+
+    - `time` in s, and `duration` in s of the arc before.
+    - `until`: the time in s at which `after` holds: that of the impact, or the end of a train.
+    - `surface`: index in the order of the scene (of its barriers, for a `LagrangianSystem`).
+    - `point` of contact in m, and unit `normal` from the surface to the ball.
+    - `before`, `after`: the state on either side of the impact; the positions are equal.
+    - `kind`: one of `KINDS`; `support`: index of the surface that the ball stays on afterwards, -1 if it flies.
+    - `grazing`: True where the closing speed is below sqrt(eps) of the speed: the time of such an impact, and its
+        derivatives, are those of the branch taken, and ill-conditioned.
+    """
+
+    time: Float[Array, "*batch log"]
+    until: Float[Array, "*batch log"]
+    duration: Float[Array, "*batch log"]
+    surface: Int[Array, "*batch log"]
+    point: Float[Array, "*batch log d"]
+    normal: Float[Array, "*batch log d"]
+    before: Any
+    after: Any
+    kind: KINDS
+    support: Int[Array, "*batch log"]
+    grazing: Bool[Array, "*batch log"]
+
+
+class Trajectory(eqx.Module):
+    """One motion through its impacts, or a batch of them with a leading axis on every field.
+
+    - `final`: state at `t1`; after the impact if one happens there.
+    - `t1`: time reached in s. Earlier than asked for if the motion ended otherwise: see `result`.
+    - `impacts`: an `ImpactLog`; `n_impacts`, how many rows there were (the log may hold fewer). A train is one.
+    - `n_arcs`: pieces of smooth motion computed: flights with `Exact`, accepted steps with `Integrated`.
+    - `result`: one of `RESULTS`.
+    - `t0`, `initial`, `system`, `motion`: what the motion began with.
+    """
+
+    final: Any
+    t1: Float[Array, "*batch"]
+    impacts: ImpactLog
+    n_impacts: Int[Array, "*batch"]
+    n_arcs: Int[Array, "*batch"]
+    result: RESULTS
+    t0: Float[Array, "*batch"]
+    initial: Any
+    system: Any  # an AbstractSystem
+    motion: Any  # an AbstractMotion
+    mapped: tuple[bool, ...] | None = eqx.field(static=True, default=None)
+
+    def at(self, t: Any) -> Any:
+        """The state at time `t` in s (scalar or array), exact between impacts: the motion is taken up at the impact
+        before `t`, not interpolated. Right-continuous at impacts; NaN outside [t0, t1], and after the last impact
+        that was logged if the log is shorter than the motion. Returns a state with the batch axis, if any, and then
+        the axes of `t` in front. Differentiable in both modes."""
+        return _at(self, jnp.asarray(t, dtype=self.t1.dtype))
+
+
+@eqx.filter_jit
+def _at(trajectory: Trajectory, t: Any) -> Any:
+    if trajectory.n_impacts.ndim == 0:
+        flat = jax.vmap(lambda each: _at_one(trajectory, each))(t.reshape(-1))
+        return jax.tree.map(lambda x: x.reshape(*t.shape, *x.shape[1:]), flat)
+    leaves, treedef = jax.tree.flatten((trajectory.system, trajectory.motion))
+    mapped = trajectory.mapped or (True,) * len(leaves)
+    axes = [0 if each and eqx.is_array(leaf) else None for each, leaf in zip(mapped, leaves, strict=True)]
+    system_axes, motion_axes = jax.tree.unflatten(treedef, axes)
+    parts = (trajectory.system, trajectory.motion)
+    rest = dataclasses.replace(trajectory, system=None, motion=None)
+
+    def one(parts, rest):
+        return _at(dataclasses.replace(rest, system=parts[0], motion=parts[1]), t)
+
+    return eqx.filter_vmap(one, in_axes=((system_axes, motion_axes), eqx.if_array(0)))(parts, rest)
+
+
+def _at_one(trajectory: Trajectory, t: Any) -> Any:
+    """The state at one time of one motion."""
+    system, log = trajectory.system, trajectory.impacts
+    rows = log.time.shape[0]
+    end = trajectory.t1
+    start, begin, phase = trajectory.initial, trajectory.t0, jnp.asarray(-1, dtype=jnp.int32)
+    if rows > 0:
+        n = jnp.minimum(trajectory.n_impacts, rows)
+        past = jnp.sum((log.until <= t) & (jnp.arange(rows, dtype=n.dtype) < n), dtype=n.dtype)
+        row = jnp.maximum(past - 1, 0)
+        start = jax.tree.map(lambda a, b: jnp.where(past > 0, a[row], b), log.after, start)
+        begin = jnp.where(past > 0, log.until[row], begin)
+        phase = jnp.where(past > 0, log.support[row], phase)
+        end = jnp.where(trajectory.n_impacts > rows, log.until[rows - 1], end)
+    else:
+        end = jnp.where(trajectory.n_impacts > 0, trajectory.t0, end)
+    inside = (t >= trajectory.t0) & (t <= end)
+    free = system.without_contacts()
+    until = jnp.where(inside, t, begin)
+    state, motion = free.unpacked(start, phase), trajectory.motion
+    state = free.prepared(begin, state) if motion.is_closed_form else state
+    if motion.is_closed_form:
+        piece = motion.piece(free, begin, state, None, jnp.asarray(True), until - begin)
+        arc, s = piece.arc, piece.arc.length
+        end_state = free.advanced(until, state, arc.position(s), arc.velocity(s), s * arc.unit)
+        end_state = jax.tree.map(lambda x: jnp.asarray(x, dtype=t.dtype), end_state)
+    else:
+        end_state = run(free, motion, state, begin, until, max_impacts=0, log_rows=0).state
+    if rows > 0:
+        summed, inner = _in_train(trajectory, past, n, t)
+        end_state = jax.tree.map(lambda a, b: jnp.where(summed, a, b), inner, end_state)
+    return jax.tree.map(lambda x: jnp.where(inside, x, jnp.nan), system.packed(end_state))
+
+
+def _in_train(trajectory: Trajectory, past: Any, n: Any, t: Any) -> tuple[Any, Any]:
+    """Whether the time falls into the train that follows `past` rows of the log, and the state if it does."""
+    system, log = trajectory.system, trajectory.impacts
+    row = jnp.minimum(past, log.time.shape[0] - 1)
+    time = log.time[row]
+    summed = (past < n) & (time <= t) & (t < log.until[row])
+    before = jax.tree.map(lambda a, b: jnp.where(summed, a[row], b), log.before, trajectory.initial)
+    elapsed = jnp.where(summed, t - time, 0.0)
+    state = system.during(jnp.maximum(log.surface[row], 0), time, system.unpacked(before), elapsed)
+    return summed, jax.tree.map(lambda x: jnp.asarray(x, dtype=t.dtype), state)
+
+
+def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any, outcome: Outcome) -> Trajectory:
+    """The user's form of an outcome."""
+    values = outcome.log.values
+    contact, code, support = (outcome.log.labels[:, i] for i in range(3))
+    row = unpack_row(values, outcome.state)
+    used = contact >= 0
+    safe = jax.tree.map(jnp.nan_to_num, frozen(outcome.state))  # harmless numbers for the rows that are not used
+    before = jax.tree.map(lambda a, b: jnp.where(along(used, a), a, b), row.before, safe)
+    if system.n_contacts > 0:
+        point, normal = jax.vmap(system.contact_frame)(contact, row.time, before)
+        point, normal = (jnp.where(used[:, None], x, jnp.nan) for x in (point, normal))
+    else:
+        point = normal = jnp.full((contact.shape[0], len(system.evolving(outcome.state)[0])), jnp.nan, t0.dtype)
+    packed_before, packed_after = jax.vmap(system.packed)(row.before), jax.vmap(system.packed)(row.after)
+    rate = frozen(jax.vmap(lambda time, state: _rate(system, time, state))(row.time, before))
+    rate = rate[:, : normal.shape[1]]  # of what the normal is of: a state may evolve more than the gaps see
+    closing, speed = jnp.abs(jnp.sum(normal * rate, axis=-1)), jnp.sqrt(jnp.sum(rate**2, axis=-1))
+    grazing = used & (closing <= float(jnp.finfo(t0.dtype).eps) ** 0.5 * speed)
+    log = ImpactLog(
+        row.time, row.until, row.duration, contact, point, normal, packed_before, packed_after,
+        kind_of(jnp.maximum(code, 0)), support, grazing,
+    )  # fmt: skip
+    return Trajectory(
+        final=system.packed(outcome.state),
+        t1=outcome.time,
+        impacts=log,
+        n_impacts=outcome.n_impacts,
+        n_arcs=outcome.n_arcs,
+        result=outcome.result,
+        t0=t0,
+        initial=state,
+        system=system,
+        motion=motion,
+    )
+
+
+def _rate(system: AbstractSystem, time: Any, state: Any) -> Any:
+    """dq/dt of one state."""
+    rate, _ = system.derivative(time, state, *system.evolving(state))
+    return jnp.stack([jnp.asarray(x, dtype=time.dtype) for x in rate])
+
+
+def flat(measures: Iterable[Any], trajectory: Trajectory) -> Float[Array, " q"]:
+    """All that is measured of one trajectory."""
+    dtype = trajectory.t1.dtype
+    parts = [jnp.ravel(jnp.asarray(measure(trajectory)).astype(dtype)) for measure in measures]
+    return jnp.concatenate(parts) if parts else jnp.zeros((0,), dtype)

@@ -1,0 +1,13 @@
+"""What moves and what it meets: balls, surfaces, air, scenes, Lagrangian systems, as the event loop asks for them."""
+
+from .air import Air as Air
+from .ball import Ball as Ball, BallState as BallState, check_ball_state as check_ball_state
+from .box import Box as Box, Rectangle as Rectangle
+from .floors import slides_across as slides_across
+from .grounded import grounded as grounded
+from .hops import ENDS as ENDS, FULL as FULL, PAUSES as PAUSES, Hopper as Hopper
+from .lagrangian import Barrier as Barrier, LagrangianSystem as LagrangianSystem, as_arrays as as_arrays
+from .round import Cylinder as Cylinder, Sphere as Sphere
+from .scene import Scene as Scene
+from .surface import AbstractSurface as AbstractSurface, Implicit as Implicit, Plane as Plane
+from .system import AbstractSystem as AbstractSystem, rounding as rounding

@@ -1,0 +1,243 @@
+"""Boxes and rectangles: a ball that touches one has its centre on a box with rounded edges and corners."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._impact import AbstractContactLaw
+from .._math import (
+    Interval,
+    Number,
+    Vector3,
+    Window,
+    add,
+    as_pair,
+    as_quaternion,
+    as_vector,
+    components,
+    cross,
+    dot,
+    is_constant,
+    matrix,
+    maximum,
+    minimum,
+    norm,
+    plus,
+    ratio,
+    scale,
+    select,
+    select_vector,
+    square,
+    subtract,
+    times,
+    total,
+    unit,
+    where_number,
+)
+from .surface import AbstractSurface, Face, check, nonzero, positive
+
+
+def _excess(y: Vector3, half: Vector3) -> Vector3:
+    """How far a point in the box's own frame is beyond each pair of faces."""
+    return tuple(maximum(plus(abs(c), times(-1.0, h)), 0.0) for c, h in zip(y, half, strict=True))  # pyright: ignore
+
+
+def _box_distance(y: Vector3, half: Vector3) -> Number:
+    inside = [plus(abs(c), times(-1.0, h)) for c, h in zip(y, half, strict=True)]
+    deepest = maximum(maximum(inside[0], inside[1]), inside[2])
+    return plus(norm(_excess(y, half)), minimum(deepest, 0.0))
+
+
+def _box_level(y: Vector3, half: Vector3, radius: Number) -> Number:
+    """(D - r^2) / 2r with D the squared distance, a sum of three clipped squares: no list of faces, edges, corners."""
+    beyond = _excess(y, half)
+    return ratio(plus(dot(beyond, beyond), times(-1.0, times(radius, radius))), times(2.0, radius))
+
+
+def _box_bend(window: Window, axes: tuple, center: Vector3, half: Vector3, radius: Number) -> Interval:
+    """The sum of the clipped squares' second derivatives, each v^2 + e a where e > 0 and 0 elsewhere, over r."""
+    lows, highs = [], []
+    dtype = jnp.result_type(*[c for p in window.coefficients for c in p if not is_constant(c)] or [float])
+    eps = 32.0 * float(jnp.finfo(dtype).eps)
+    for axis, h in zip(axes, half, strict=True):
+        value, rate, bend = window.along(axis, center)
+        farthest = maximum(plus(maximum(value.high, times(-1.0, value.low)), times(-1.0, h)), 0.0)
+        # The excess e grows with the coordinate on the right of the box and against it on the left.
+        right, left = value.low > 0, value.high < 0
+        either = maximum(abs(bend.low), abs(bend.high))
+        away = where_number(right, bend.high, where_number(left, times(-1.0, bend.low), either))
+        back = where_number(right, times(-1.0, bend.low), where_number(left, bend.high, either))
+        squares = square(rate)
+        bend_low = plus(squares.low, times(-1.0, times(farthest, maximum(back, 0.0))))
+        # Beyond the edge all along, to rounding: a ball that rolls off must not seem to fall back.
+        nearest, slack = maximum(value.low, times(-1.0, value.high)), times(eps, plus(h, abs(dot(axis, center))))
+        lows.append(where_number(plus(nearest, slack) >= h, bend_low, minimum(bend_low, 0.0)))
+        highs.append(where_number(farthest > 0, plus(squares.high, times(farthest, maximum(away, 0.0))), 0.0))
+    return Interval(ratio(total(lows), radius), ratio(total(highs), radius))
+
+
+def _box_direction(y: Vector3, half: Vector3, axes: tuple) -> Vector3:
+    beyond = [times(e, where_number(c < 0, -1.0, 1.0)) for c, e in zip(y, _excess(y, half), strict=True)]
+    n = unit(beyond)
+    return add(add(scale(n[0], axes[0]), scale(n[1], axes[1])), scale(n[2], axes[2]))
+
+
+def along(x: Vector3, axes: tuple) -> Vector3:
+    """The components of a vector."""
+    return tuple(dot(axis, x) for axis in axes)  # pyright: ignore
+
+
+def _in_frame(x: Vector3, center: Vector3, axes: tuple) -> Vector3:
+    return along(subtract(x, center), axes)
+
+
+def _rotation_axes(rotation: Any) -> tuple:
+    """The box's own axes in the world frame; exact constants where there is no rotation."""
+    if rotation is None:
+        return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    if isinstance(rotation, tuple) and all(is_constant(c) for c in rotation):
+        with jax.ensure_compile_time_eval():
+            turn = np.asarray(matrix(rotation), dtype=float)
+        return tuple(tuple(float(c) for c in column) for column in turn.T)
+    turn = matrix(jnp.stack([jnp.asarray(c) for c in rotation]) if isinstance(rotation, tuple) else rotation)
+    return tuple(tuple(turn[i, j] for i in range(3)) for j in range(3))
+
+
+class AbstractBlock(AbstractSurface):
+    """What a solid box and a thin plate share: half sizes along axes of their own."""
+
+    center: eqx.AbstractVar[Any]
+    half_size: eqx.AbstractVar[Any]
+
+    @abstractmethod
+    def _frame(self) -> tuple[Any, Any, tuple]:
+        """The centre, three half sizes, and the axes in the world frame."""
+
+    def in_frame(self, x: Vector3) -> tuple[Vector3, tuple, Vector3]:
+        """A point in the block's own frame, the axes of that in the world, and the half sizes."""
+        center, half, axes = self._frame()
+        return _in_frame(x, center, axes), axes, half
+
+    def direction(self, x, t):
+        center, half, axes = self._frame()
+        return _box_direction(_in_frame(x, center, axes), half, axes)
+
+    def level(self, x, t, radius):
+        center, half, axes = self._frame()
+        return _box_level(_in_frame(x, center, axes), half, radius)
+
+    def reach(self, x, radius):
+        center, half, axes = self._frame()
+        return maximum(norm(_excess(_in_frame(x, center, axes), half)), radius)
+
+    def bend(self, window, t, radius):
+        center, half, axes = self._frame()
+        return _box_bend(window, axes, center, half, radius)
+
+    def extent(self):
+        return plus(norm(components(self.center)), norm(components(self.half_size)))
+
+
+def _face(x: Vector3, center: Vector3, half: Vector3, axes: tuple, choices: Sequence[int]) -> Face:
+    """The face that a point is farthest beyond, of those across the axes `choices`."""
+    y = _in_frame(x, center, axes)
+    beyond = _excess(y, half)
+    best = jnp.argmax(jnp.stack([jnp.asarray(beyond[k]) for k in choices]))
+    side = select(best, [where_number(y[k] < 0, -1.0, 1.0) for k in choices])
+    normal = scale(side, select_vector(best, [axes[k] for k in choices]))
+    first, second = ([(k + i) % 3 for k in choices] for i in (1, 2))
+    tangents = tuple(select_vector(best, [axes[k] for k in each]) for each in (first, second))
+    sizes = tuple(select(best, [half[k] for k in each]) for each in (first, second))
+    below = select(best, [jnp.where(beyond[i] + beyond[j] > 0, 0.0, 1.0) for i, j in zip(first, second, strict=True)])
+    return Face(normal, center, tangents, sizes, below > 0.5)  # pyright: ignore
+
+
+class Box(AbstractBlock):
+    """A solid box with faces, edges and corners: a table top, a step, a brick.
+
+    **Arguments:** `center` in m, shape (3,); `half_size` in m, shape (3,), positive; `law` of contact; `rotation`, a
+    quaternion (w, x, y, z) from the box's own axes to the world, or `None` for a box along the axes. Raises
+    `ValueError` for half sizes that are not positive.
+
+    ```python
+    from nonholo_jax import Box, Rough
+    table = Box(center=(0.6, 0.0, 0.715), half_size=(0.6, 0.4, 0.015), law=Rough())
+    ```
+    """
+
+    center: Any = eqx.field(converter=as_vector)
+    half_size: Any = eqx.field(converter=as_vector)
+    law: AbstractContactLaw
+    rotation: Any = eqx.field(converter=as_quaternion, default=None)
+
+    def __check_init__(self):
+        check(self)
+
+    def _frame(self):
+        return components(self.center), components(self.half_size), _rotation_axes(self.rotation)
+
+    def distance(self, x, t):
+        center, half, axes = self._frame()
+        return _box_distance(_in_frame(x, center, axes), half)
+
+    def face(self, x, t):
+        center, half, axes = self._frame()
+        return _face(x, center, half, axes, (0, 1, 2))
+
+    def is_proper(self, radius):
+        return [positive("half_size", h) for h in components(self.half_size)]
+
+
+class Rectangle(AbstractBlock):
+    """A thin plate with edges; the ball bounces on both of its sides.
+
+    **Arguments:** `center` in m, shape (3,); `normal`, shape (3,); `tangent`, shape (3,), the direction of the first
+    side (its part along the normal is removed); `half_size` of the two sides in m, shape (2,), positive; `law` of
+    contact. Raises `ValueError` for a zero normal, a tangent along the normal, or half sizes that are not positive.
+
+    ```python
+    from nonholo_jax import Rectangle, Rough
+    shelf = Rectangle((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.5, 0.2), Rough())
+    ```
+    """
+
+    center: Any = eqx.field(converter=as_vector)
+    facing: Any = eqx.field(converter=as_vector)
+    tangent: Any = eqx.field(converter=as_vector)
+    half_size: Any = eqx.field(converter=as_pair)
+    law: AbstractContactLaw
+
+    def __init__(self, center: Any, normal: Any, tangent: Any, half_size: Any, law: AbstractContactLaw):
+        self.center, self.facing, self.tangent = as_vector(center), as_vector(normal), as_vector(tangent)
+        self.half_size, self.law = as_pair(half_size), law
+        check(self)
+
+    def _frame(self):
+        n = unit(components(self.facing))
+        raw = components(self.tangent)
+        tangent = unit(subtract(raw, scale(dot(raw, n), n)))
+        half = components(self.half_size)
+        return components(self.center), (half[0], half[1], 0.0), (tangent, cross(n, tangent), n)
+
+    def distance(self, x, t):
+        center, half, axes = self._frame()
+        return norm(_excess(_in_frame(x, center, axes), half))
+
+    def face(self, x, t):
+        center, half, axes = self._frame()
+        return _face(x, center, half, axes, (2,))
+
+    def is_proper(self, radius):
+        n, raw = components(self.facing), components(self.tangent)
+        sideways = norm(cross(n, raw)) > 0
+        sentence = f"`tangent` must not be along `normal`, but got {self.tangent} and {self.facing}"
+        return [
+            nonzero("normal", self.facing),
+            (sideways, sentence),
+            *[positive("half_size", h) for h in components(self.half_size)],
+        ]

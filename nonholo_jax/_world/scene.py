@@ -1,0 +1,298 @@
+"""A scene: one ball, named surfaces, gravity and perhaps air."""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from .._impact import collide_with_all, is_one_mu
+from .._math import (
+    Vector3,
+    Window,
+    add,
+    as_vector,
+    components,
+    cross,
+    dot,
+    is_constant,
+    plus,
+    ratio,
+    scale,
+    select,
+    select_vector,
+    shared,
+    subtract,
+    times,
+    total,
+    turned,
+)
+from .air import Air
+from .ball import Ball, BallState, check_ball_state
+from .box import AbstractBlock, along
+from .hops import Block, Hopper, Wall, hop, hop_again
+from .surface import AbstractSurface, Plane
+from .system import AbstractSystem, bounces, rounding
+
+
+class Flight(NamedTuple):
+    """A ball's state inside the engine: one scalar per component."""
+
+    position: Vector3
+    velocity: Vector3
+    spin: Vector3
+    orientation: Any
+
+
+class Scene(AbstractSystem):
+    """A ball and what it can hit.
+
+    **Arguments:**
+
+    - `ball`: a `Ball`.
+    - `surfaces`: a mapping from names to surfaces, in the order that `ImpactLog.surface` counts. May be empty.
+    - `gravity`: acceleration in m/s^2, shape (3,).
+    - `air`: an `Air`, or `None` for flight along parabolas.
+
+    Every number may be a JAX array: it is then traced, and can be differentiated and mapped over. Numbers of Python
+    become constants of the compiled program. Raises `ValueError` where a number that is known is not admissible.
+
+    ```python
+    from nonholo_jax import Ball, Plane, Rough, Scene
+    floor = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Rough(restitution=0.9))
+    scene = Scene(Ball(radius=0.025, mass=0.046), {"floor": floor})
+    ```
+    """
+
+    ball: Ball
+    surfaces: tuple[AbstractSurface, ...]
+    gravity: Any = eqx.field(converter=as_vector)
+    air: Air | None
+    names: tuple[str, ...] = eqx.field(static=True)
+    is_long: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        ball: Ball,
+        surfaces: Mapping[str, AbstractSurface],
+        gravity: Any = (0.0, 0.0, -9.81),
+        air: Air | None = None,
+    ):
+        if not isinstance(ball, Ball):
+            raise ValueError(f"Argument `ball` must be a Ball, but got {ball!r}; try Ball(radius=0.025, mass=0.046).")
+        if not isinstance(surfaces, Mapping) or not all(isinstance(s, AbstractSurface) for s in surfaces.values()):
+            raise ValueError(
+                f"Argument `surfaces` must map names to surfaces, but got {surfaces!r}; try {{'floor': Plane(...)}}."
+            )
+        self.ball = ball
+        self.surfaces = tuple(surfaces.values())
+        self.names = tuple(surfaces)
+        self.gravity = as_vector(gravity)
+        self.air = air
+        for name, surface in surfaces.items():
+            for holds, sentence in surface.is_proper(ball.radius):
+                if isinstance(holds, bool) and not holds:
+                    raise ValueError(f"Surface `{name}`: argument {sentence}.")
+
+    def surface(self, name: str) -> AbstractSurface:
+        """The surface of that name; raises `ValueError` with the known names if there is none."""
+        if name not in self.names:
+            raise ValueError(f"Argument `name` must be one of {', '.join(self.names)}, but got {name!r}.")
+        return self.surfaces[self.names.index(name)]
+
+    @property
+    def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return len(self.surfaces)
+
+    def evolving(self, state: Flight) -> tuple:
+        return state.position, state.velocity
+
+    def is_uniform(self):
+        return self.air is None
+
+    def prepared(self, time, state):
+        return state
+
+    def derivative(self, time, state, q, v):
+        g = components(self.gravity)
+        return v, g if self.air is None else add(g, self.air.acceleration(self.ball, v, state.spin))
+
+    def advanced(self, time, state, q, v, duration):
+        orientation = state.orientation
+        if orientation is not None:  # the spin is constant in flight, so that the rotation is exact
+            angle = jnp.stack([jnp.asarray(w * duration, dtype=orientation.dtype) for w in state.spin])
+            orientation = turned(orientation, angle)
+        return Flight(q, v, state.spin, orientation)
+
+    def follows(self, contact, time, state, bounced, left, rests, ends):
+        return bounces(ends)
+
+    def during(self, contact, time, state, elapsed):
+        return state
+
+    def named(self, contact, state):
+        return contact
+
+    def is_at_rest(self, contact, time, before, after):
+        return jnp.asarray(False)
+
+    def phase(self, state):
+        return jnp.asarray(-1, dtype=jnp.int32)
+
+    def impact(self, contact, time, state, bounced, kind):
+        return bounced, 0.0
+
+    def bounced(self, contact, time, state):
+        """Theorem 5.2 for any normal and any law; at a corner, (4.2) for all that is hit if that has one mu."""
+        single = self._single_impact(contact, time, state)
+        alike = [i for i, surface in enumerate(self.surfaces) if is_one_mu(surface.law)]
+        if len(alike) < 2:
+            return single
+        hits = [self._is_hit_with(contact, i, time, state) for i in alike]
+        several = total([jnp.where(hit, 1.0, 0.0) for hit in hits]) > 1.5
+
+        def at_corner(_):
+            surfaces = [self.surfaces[i] for i in alike]
+            laws, normals = [each.law for each in surfaces], [each.direction(state.position, time) for each in surfaces]
+            mu = select(contact, [surface.law.restitution for surface in self.surfaces])
+            radius, alpha = self.ball.radius, self.ball.inertia_ratio
+            velocity, spin = collide_with_all(radius, alpha, laws, normals, hits, mu, state.velocity, state.spin)
+            return as_arrays(state._replace(velocity=velocity, spin=spin))
+
+        as_arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=time.dtype), tree)  # noqa: E731
+        corner = lax.cond(eqxi.unvmap_any(several), at_corner, lambda one: one, as_arrays(single))
+        return jax.tree.map(lambda a, b: jnp.where(several, a, b), corner, single)
+
+    def _is_hit_with(self, contact: Any, other: int, time: Any, state: Flight) -> Any:
+        """Whether a surface is touched and closed in on when another one is hit that has the same mu."""
+        surface, x = self.surfaces[other], state.position
+        touches = abs(self.level(other, time, x, state)) <= 16.0 * rounding(self, other, x)
+        closes = dot(surface.direction(x, time), state.velocity) < 0
+        mu = select(contact, [each.law.restitution for each in self.surfaces])
+        known = jnp.any(jnp.stack([contact == i for i, each in enumerate(self.surfaces) if is_one_mu(each.law)]))
+        return known & ((contact == other) | (touches & closes & jnp.asarray(surface.law.restitution == mu)))
+
+    def _single_impact(self, contact, time, state):
+        n = shared(select_vector(contact, [surface.direction(state.position, time) for surface in self.surfaces]))
+        velocity, spin = self._after(contact, n, state.velocity, state.spin)
+        return Flight(state.position, velocity, spin, state.orientation)
+
+    def _after(self, contact: Any, n: Vector3, velocity: Vector3, spin: Vector3, shared: Callable = shared) -> Any:
+        """Velocity and spin after an impact on one surface, with the normal there."""
+        ball = self.ball
+        e_n = select(contact, [surface.law.restitution for surface in self.surfaces])
+        closing = dot(n, velocity)
+        slip = subtract(subtract(velocity, scale(ball.radius, cross(spin, n))), scale(closing, n))
+        closing, *slip = shared([closing, *slip])
+        sizes = (ball.inertia_ratio, abs(closing), dot(slip, slip))
+        s = select(contact, [surface.law.slip_factor(*sizes) for surface in self.surfaces])
+        s, rebound = shared([s, times(plus(1.0, e_n), closing)])
+        kick = add(scale(rebound, n), scale(s, slip))
+        twist = times(s, ratio(1.0, times(ball.inertia_ratio, ball.radius)))
+        return subtract(velocity, kick), add(spin, scale(twist, cross(n, tuple(slip))))
+
+    def hopper(self, state):
+        if len(self.surfaces) == 0 or self.air is not None or state.orientation is not None:
+            return None
+        if all(type(each) is Plane for each in self.surfaces):
+            return Hopper(self.hop, self.hop_again)
+        known = all(isinstance(each, (Plane, AbstractBlock)) for each in self.surfaces)
+        return Hopper(self.hop, None) if known else None
+
+    def hop(self, touching, going, full, left, state, dies_out=lambda *_: False):
+        """A parabola and the impact that ends it; `dies_out(i, wall, speed, left)` says whether bounces may end after
+        an impact."""
+        walls, g, kicked = self._hopping(left, state)
+        parts = (state.position, state.velocity, state.spin)
+        done = hop(walls, g, kicked, dies_out, touching, going, full, left, parts)
+        position, velocity, spin = done.state
+        return done._replace(state=Flight(position, velocity, spin, None))
+
+    def hop_again(self, touching, choice, left, state):
+        """The same with derivatives, after the choice has been made."""
+        walls, g, kicked = self._hopping(left, state)
+        parts = (state.position, state.velocity, state.spin)
+        duration, (position, velocity, spin) = hop_again(walls, g, kicked, touching, choice, left, parts)
+        return duration, Flight(position, velocity, spin, None)
+
+    def _hopping(self, left, state):
+        """Planes, gravity and impacts, as hops see them."""
+        g, x = components(self.gravity), state.position
+        walls, origin, zero = [], (0.0, 0.0, 0.0), jnp.zeros_like(left)
+        half_g, v = scale(0.5, g), state.velocity
+        for i, surface in enumerate(self.surfaces):
+            noise = rounding(self, i, x)
+            if isinstance(surface, AbstractBlock):
+                place, axes, half = surface.in_frame(x)
+                walls.append(Block(place, along(v, axes), along(half_g, axes), half, self.ball.radius, noise))
+            else:
+                n = surface.direction(x, 0.0)
+                gap, there = (self.level(i, zero, place, state) for place in (x, origin))
+                walls.append(Wall(n, gap, dot(n, v), dot(n, half_g), noise, there))
+
+        def kicked(choice, position, velocity, spin):
+            n = select_vector(choice, [surface.direction(position, 0.0) for surface in self.surfaces])
+            # Only the slip is shared: each number more is one more pass over the batch.
+            return self._after(choice, n, velocity, spin, lambda x: (x[0], *shared(x[1:])) if len(x) > 2 else x)
+
+        return walls, g, kicked
+
+    def level(self, contact, time, q, state):
+        return self.surfaces[contact].level(q, time, self.ball.radius)
+
+    def face(self, contact, time, q):
+        law = self.surfaces[contact].law  # elastic bounces stay high
+        elastic = is_constant(law.restitution) and law.restitution == 1
+        return None if elastic else self.surfaces[contact].face(q, time)
+
+    def reach(self, contact, q):
+        return self.surfaces[contact].reach(q, self.ball.radius)
+
+    def bend(self, contact, time, window: Window, state):
+        return self.surfaces[contact].bend(window, time, self.ball.radius)
+
+    def is_bounded(self, contact):
+        return self.surfaces[contact].is_bounded()
+
+    def extent(self, contact):
+        return plus(self.surfaces[contact].extent(), self.ball.radius)
+
+    def is_admissible(self, time, state):
+        leaves = jax.tree.leaves((self, state))
+        holds = [jnp.all(jnp.isfinite(jnp.asarray(leaf))) for leaf in leaves]
+        holds += [jnp.asarray(value > 0) for value in (self.ball.radius, self.ball.mass, self.ball.inertia_ratio)]
+        for i, surface in enumerate(self.surfaces):
+            checks = [*surface.is_proper(self.ball.radius), *surface.law.admissible()]
+            holds += [jnp.asarray(check) for check, _ in checks]
+            depth = self.level(i, time, state.position, state) + 16.0 * rounding(self, i, state.position)
+            holds.append(jnp.asarray(depth >= 0))
+        return functools.reduce(jnp.logical_and, holds)
+
+    def received(self, state, batch, t0):
+        check_ball_state(state, batch)
+        return state
+
+    def unpacked(self, state: BallState, phase=None) -> Flight:
+        dtype = state.position.dtype
+        parts = [components(x.astype(dtype)) for x in (state.position, state.velocity, state.spin)]
+        orientation = state.orientation
+        if orientation is not None:
+            orientation = orientation.astype(dtype) / jnp.linalg.norm(orientation.astype(dtype))
+        return Flight(*parts, orientation)  # pyright: ignore
+
+    def packed(self, state: Flight) -> BallState:
+        parts = [jnp.stack(x, axis=-1) for x in (state.position, state.velocity, state.spin)]
+        return BallState(parts[0], parts[1], parts[2], state.orientation)
+
+    def contact_frame(self, contact, time, state: Flight):
+        n = select_vector(contact, [surface.direction(state.position, time) for surface in self.surfaces])
+        n = tuple(jnp.asarray(c, dtype=time.dtype) for c in n)
+        point = subtract(state.position, scale(self.ball.radius, n))
+        return jnp.stack(point), jnp.stack(n)
+
+    def without_contacts(self) -> "Scene":
+        return Scene(self.ball, {}, self.gravity, self.air)

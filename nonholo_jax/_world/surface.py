@@ -1,0 +1,232 @@
+"""Surfaces: where they are, which way they face, and bounds that let a crossing be found without passing it."""
+
+from abc import abstractmethod
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from .._impact import AbstractContactLaw
+from .._math import (
+    Interval,
+    Number,
+    Scalar,
+    Vector,
+    Vector3,
+    Window,
+    as_number,
+    as_vector,
+    bend_of,
+    components,
+    dot,
+    gradient_of,
+    norm,
+    pack,
+    plus,
+    reach_of,
+    times,
+    unit,
+    value_of,
+)
+
+
+class Face(NamedTuple):
+    """A flat piece of a surface, on which a ball can roll."""
+
+    normal: Vector3
+    center: Vector3
+    tangents: tuple[Vector3, Vector3]
+    half: tuple[Number, Number] | None  # half sizes along the tangents; `None` for a face without edges
+    below: Any  # whether the ball's centre is over it, not over an edge
+
+
+class AbstractSurface(eqx.Module):
+    """A surface that the ball bounces on. Subclasses say, by components and for a point x, the signed `distance`, the
+    `direction` from the surface to the point, and a bound of the second derivative of the `level` along a path."""
+
+    law: eqx.AbstractVar[AbstractContactLaw]
+
+    def __check_init__(self):
+        if not isinstance(self.law, AbstractContactLaw):
+            raise ValueError(f"Argument `law` must be a contact law, but got {self.law!r}; try Rough(restitution=0.9).")
+
+    @abstractmethod
+    def distance(self, x: Vector3, t: Number) -> Number:
+        """Signed distance of a point from the surface in m."""
+
+    @abstractmethod
+    def direction(self, x: Vector3, t: Number) -> Vector3:
+        """The unit normal, from the surface to the point."""
+
+    @abstractmethod
+    def level(self, x: Vector3, t: Number, radius: Number) -> Number:
+        """A smooth function of the ball's centre with the zeros of the gap, and unit gradient there."""
+
+    @abstractmethod
+    def reach(self, x: Vector3, radius: Number) -> Number | None:
+        """The length over which `bend` is tight, or `None` where it is so everywhere."""
+
+    @abstractmethod
+    def bend(self, window: Window, t: Number, radius: Number) -> Interval:
+        """Bounds of the second derivative of the level along the path in the window."""
+
+    @abstractmethod
+    def extent(self) -> Number:
+        """The size of the numbers that describe the surface, in m."""
+
+    @abstractmethod
+    def is_proper(self, radius: Number) -> list:
+        """Conditions on the surface for a ball of that radius, each a pair (bool, sentence)."""
+
+    def face(self, x: Vector3, t: Number) -> Face | None:
+        """The flat piece that a ball at `x` would roll on; `None` for a surface that has none."""
+        del x, t
+        return None
+
+    def clearance(self, x: Vector3, t: Number, radius: Number) -> Number:
+        """How far at least the centre of a ball at `x` can go in any direction before it touches, in m."""
+        return plus(self.distance(x, t), times(-1.0, radius))
+
+    def is_bounded(self) -> bool:
+        """Whether `bend` is a true bound, not an estimate from samples."""
+        return getattr(self, "curvature", 0.0) is not None
+
+    def gap(self, x: Vector, t: float | Scalar = 0.0, radius: float | Scalar = 0.0) -> Scalar:
+        """Signed distance from the skin of a ball of `radius` (in m) centred at `x` (shape (3,), in m) to the surface,
+        negative if it penetrates. With the default radius, the distance of the point `x`."""
+        return jnp.asarray(plus(self.distance(components(x), t), times(-1.0, radius)), dtype=x.dtype)
+
+    def normal(self, x: Vector, t: float | Scalar = 0.0) -> Vector:
+        """Unit normal from the surface to the point `x`, shape (3,)."""
+        return pack(self.direction(components(x), t), x)
+
+    def velocity(self, point: Vector, t: float | Scalar = 0.0) -> Vector:
+        """Velocity of the surface at `point`, in m/s, shape (3,): zero for every surface of this version."""
+        return jnp.zeros_like(point)
+
+
+def nonzero(name: str, vector: Any) -> tuple:
+    length = norm(components(vector))
+    return (length > 0, f"`{name}` must not be the zero vector, but got {vector}")
+
+
+def check(surface: AbstractSurface, radius: Number = 0.0) -> None:
+    """Raise for what is known now to be wrong; traced values end as `RESULTS.invalid_state`."""
+    for holds, sentence in surface.is_proper(radius):
+        if isinstance(holds, bool) and not holds:
+            raise ValueError(f"Argument {sentence}.")
+
+
+def positive(name: str, value: Number) -> tuple:
+    return (value > 0, f"`{name}` must be positive, but got {value}; use SI units")
+
+
+class Plane(AbstractSurface):
+    """A half-space: the ball stays on the side of the normal.
+
+    **Arguments:** `point` on the plane in m, shape (3,); `normal`, shape (3,), any length but zero, towards the ball;
+    `law` of contact. Raises `ValueError` for a zero normal.
+
+    ```python
+    from nonholo_jax import Plane, Rough
+    floor = Plane(point=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), law=Rough())
+    ```
+    """
+
+    point: Any = eqx.field(converter=as_vector)
+    facing: Any = eqx.field(converter=as_vector)
+    law: AbstractContactLaw
+
+    def __init__(self, point: Any, normal: Any, law: AbstractContactLaw):
+        self.point, self.facing, self.law = as_vector(point), as_vector(normal), law
+        check(self)
+
+    def distance(self, x, t):
+        n = self.direction(x, t)
+        # Two dot products, not dot(n, x - point): a floor at height 0 then costs nothing.
+        return plus(dot(n, x), times(-1.0, dot(n, components(self.point))))
+
+    def direction(self, x, t):
+        return unit(components(self.facing))
+
+    def face(self, x, t):
+        still = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        return Face(self.direction(x, t), components(self.point), still, None, True)
+
+    def level(self, x, t, radius):
+        return plus(self.distance(x, t), times(-1.0, radius))
+
+    def reach(self, x, radius):
+        return None
+
+    def bend(self, window, t, radius):
+        return window.along(unit(components(self.facing)), (0.0, 0.0, 0.0)).bend
+
+    def extent(self):
+        return norm(components(self.point))
+
+    def is_proper(self, radius):
+        return [nonzero("normal", self.facing)]
+
+
+class Implicit(AbstractSurface):
+    """Any surface, given as the zeros of a smooth function of the ball's centre.
+
+    **Arguments:**
+
+    - `function`: `gap(x, t)` of the ball's centre x (shape (3,), in m) at time t, in m: positive apart, zero at
+        contact; it need not be a distance, but its gradient must not vanish at contact. It must not depend on t in
+        this version. It may be an `equinox.Module` whose fields are traced.
+    - `law` of contact.
+    - `curvature`: a bound in 1/m of the norm of the second derivative of the function. With it no crossing is ever
+        passed. Without it `Exact` refuses the surface; `Integrated` then bounds the second derivative along each step
+        from five samples with their spread as margin, which can pass a bump much narrower than a step.
+
+    ```python
+    import jax.numpy as jnp
+    from nonholo_jax import Implicit, Rough
+    hills = Implicit(lambda x, t: x[2] - 0.1 * jnp.sin(x[0]) - 0.05, Rough(), curvature=0.1)
+    ```
+    """
+
+    function: Any
+    law: AbstractContactLaw
+    curvature: Number | None = eqx.field(converter=as_number, default=None)
+
+    def __init__(self, gap: Any, law: AbstractContactLaw, curvature: Any = None):
+        # A plain function is no pytree of arrays; `Partial` makes it one without leaves.
+        self.function = gap if isinstance(gap, eqx.Module) else jax.tree_util.Partial(gap)
+        self.law = law
+        self.curvature = as_number(curvature)
+        check(self)
+
+    def distance(self, x, t):
+        return value_of(lambda p: self.function(p, t), x)
+
+    def gap(self, x: Vector, t: float | Scalar = 0.0, radius: float | Scalar = 0.0) -> Scalar:
+        """The given function at the ball's centre `x`; the radius is already in it."""
+        return self.function(x, t)
+
+    def direction(self, x, t):
+        return unit(gradient_of(lambda p: self.function(p, t), x))
+
+    def clearance(self, x, t, radius):
+        return 0.0  # a gap with any slope tells no distance
+
+    def level(self, x, t, radius):
+        return value_of(lambda p: self.function(p, t), x)
+
+    def reach(self, x, radius):
+        return reach_of(self.curvature)
+
+    def bend(self, window, t, radius):
+        return bend_of(lambda p: self.function(p, t), self.curvature, window)
+
+    def extent(self):
+        return 0.0
+
+    def is_proper(self, radius):
+        if self.curvature is None:
+            return []
+        return [(self.curvature >= 0, f"`curvature` must not be negative, but got {self.curvature}")]

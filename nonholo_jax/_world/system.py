@@ -1,0 +1,140 @@
+"""What the event loop asks of a mechanical system."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from .._math import KINDS, RESULTS, Index, Interval, Number, Scalar, Window, is_constant, plus, times, total
+from .hops import Hopper
+
+
+class AbstractSystem(eqx.Module):
+    """A system that moves smoothly between contacts. Its state is any pytree; what evolves of it, and what its gaps
+    see, are tuples of scalars. A contact is crossed where its `level` goes from positive to negative: a smooth
+    function with the zeros of the gap, and its derivative there, that is cheaper to bound than the gap itself."""
+
+    n_contacts: eqx.AbstractVar[int]
+    is_long: eqx.AbstractClassVar[bool]  # `derivative` is a long program: a loop should hold it only once
+
+    @abstractmethod
+    def evolving(self, state: Any) -> tuple[tuple[Number, ...], tuple[Number, ...]]:
+        """The configuration that gaps see, and its velocity: two tuples of scalars."""
+
+    @abstractmethod
+    def prepared(self, time: Scalar, state: Any) -> Any:
+        """The state at which an arc begins, with what is worth computing only once for all of the arc."""
+
+    @abstractmethod
+    def derivative(self, time: Scalar, state: Any, q: tuple, v: tuple) -> tuple[tuple[Number, ...], tuple[Number, ...]]:
+        """The rates of q and of v on the arc that begins at `state`."""
+
+    @abstractmethod
+    def is_uniform(self) -> bool:
+        """Whether on every arc v is the rate of as many q and has a constant rate itself, and other q have a constant
+        rate: arcs are then parabolas."""
+
+    @abstractmethod
+    def advanced(self, time: Scalar, state: Any, q: tuple, v: tuple, duration: Number) -> Any:
+        """The state at `time`, after smooth motion from `state` to (q, v) during `duration` seconds."""
+
+    @abstractmethod
+    def bounced(self, contact: Index, time: Scalar, state: Any) -> Any:
+        """The state after an impact on the contact of that index, if nothing but a bounce follows."""
+
+    @abstractmethod
+    def follows(
+        self, contact: Index, time: Scalar, state: Any, bounced: Any, left: Scalar, rests: Any, ends: Any
+    ) -> tuple[KINDS, RESULTS]:
+        """What follows when a contact is crossed in `state`, `left` seconds before the end, and whether the motion can
+        go on (`RESULTS.reached_t1`) or why not. `rests` says that a bounce would not rise above rounding, `ends` that
+        it could not even be computed."""
+
+    @abstractmethod
+    def impact(self, contact: Index, time: Scalar, state: Any, bounced: Any, kind: KINDS) -> tuple[Any, Scalar | float]:
+        """The state after crossing a contact, given what follows, and how many seconds have passed by then."""
+
+    @abstractmethod
+    def during(self, contact: Index, time: Scalar, state: Any, elapsed: Scalar) -> Any:
+        """The state `elapsed` seconds after a contact was crossed in `state`, within the time that `impact` takes."""
+
+    @abstractmethod
+    def named(self, contact: Index, state: Any) -> Index:
+        """The contact that the log names, and that is touched afterwards: that itself, but for the edges of a face."""
+
+    @abstractmethod
+    def is_at_rest(self, contact: Index, time: Scalar, before: Any, after: Any) -> Bool[Array, ""]:
+        """Whether nothing moves any more after an impact."""
+
+    @abstractmethod
+    def phase(self, state: Any) -> Index:
+        """Which motion a state is in: -1 if free, else the index of the contact that it stays on."""
+
+    @abstractmethod
+    def level(self, contact: int, time: Scalar, q: tuple, state: Any) -> Number:
+        """Positive apart, zero at contact, negative beyond; there its derivative is that of the gap in metres. `state`
+        is the one at which the arc began."""
+
+    @abstractmethod
+    def face(self, contact: int, time: Scalar, q: tuple) -> Any:
+        """The flat `Face` of a surface that q is on, if low bounces on it are to be exact, else `None`."""
+
+    @abstractmethod
+    def reach(self, contact: int, q: tuple) -> Number | None:
+        """A length over which `bend` is worth asking for; `None` if it is as good over the whole arc."""
+
+    @abstractmethod
+    def bend(self, contact: int, time: Scalar, window: Window, state: Any) -> Interval:
+        """Bounds of the second derivative of the level along the window."""
+
+    @abstractmethod
+    def is_bounded(self, contact: int) -> bool:
+        """Whether `bend` is a true bound, not an estimate from samples."""
+
+    @abstractmethod
+    def extent(self, contact: int) -> Number:
+        """The size of the numbers that the level is computed from, in metres: it sets the rounding error."""
+
+    @abstractmethod
+    def is_admissible(self, time: Scalar, state: Any) -> Bool[Array, ""]:
+        """Whether the motion can start there."""
+
+    @abstractmethod
+    def received(self, state: Any, batch: bool, t0: Any) -> Any:
+        """A user's state (or a batch of them) at t0 as arrays. Raises `ValueError` for what cannot be right."""
+
+    @abstractmethod
+    def unpacked(self, state: Any, phase: Index | None = None) -> Any:
+        """The engine's form of a user's state, in the free phase or a given one: a pytree of scalars of one dtype."""
+
+    @abstractmethod
+    def packed(self, state: Any) -> Any:
+        """The user's form of an engine's state."""
+
+    @abstractmethod
+    def contact_frame(self, contact: Index, time: Scalar, state: Any) -> tuple[Array, Array]:
+        """The point of contact and the gradient of the gap there."""
+
+    @abstractmethod
+    def hopper(self, state: Any) -> Hopper | None:
+        """Where the next impact is known in closed form, until something unusual happens: how to make one arc and the
+        impact that ends it. Elsewhere `None`."""
+
+    @abstractmethod
+    def without_contacts(self) -> "AbstractSystem":
+        """The same system with nothing to hit."""
+
+
+def bounces(ends: Any) -> tuple[KINDS, RESULTS]:
+    """What follows an impact where nothing but a bounce can: `follows` of a system without other phases."""
+    kind = KINDS.where(ends, KINDS.unused, KINDS.bounce)
+    return kind, RESULTS.where(ends, RESULTS.sustained_contact, RESULTS.reached_t1)
+
+
+def rounding(system: AbstractSystem, contact: int, q: Sequence[Number]) -> Number:
+    """The rounding error of a level in m: a few eps of the numbers that it is computed from."""
+    dtype = jnp.result_type(*[c for c in q if not is_constant(c)])
+    return times(8.0 * float(jnp.finfo(dtype).eps), plus(total([abs(c) for c in q]), system.extent(contact)))
