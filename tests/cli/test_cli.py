@@ -411,7 +411,7 @@ def test_help_is_exit_code_0(capsys):
 def test_a_process_of_its_own_draws_and_leaves_standard_output_to_the_answer(tmp_path):
     (tmp_path / "bounce.toml").write_text(BOUNCE)
     command = [sys.executable, "-c", "import sys; from nonholo_jax.cli import main; sys.exit(main())"]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 
     def run(*arguments):
         return subprocess.run([*command, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True)

@@ -168,7 +168,7 @@ def test_bounces_on_where_another_surface_is_near():
 
 def test_scene_of_dying_bounces():
     """The scene file, on a box: the train's end equals the sum of its bounces, and energy never increases."""
-    file = load_scene(pathlib.Path(__file__).parent.parent / "experiments" / "scenes" / "dying_bounces.toml")
+    file = load_scene(pathlib.Path(__file__).parents[2] / "experiments" / "scenes" / "dying_bounces.toml")
     assert file.simulate is not None
     options = file.simulate.arguments
     trajectory = simulate(file.scene, file.throw, **options)

@@ -26,7 +26,7 @@ from nonholo_jax import (
 from nonholo_jax.cli import main
 from nonholo_jax.scene_file import load_scene
 
-SCENES = pathlib.Path(__file__).parents[1] / "experiments" / "scenes"
+SCENES = pathlib.Path(__file__).parents[2] / "experiments" / "scenes"
 R, G = 0.025, 9.81
 START = [0.0, 0.0, 1.0]
 FALL = (np.sqrt(2.0**2 + 2 * G * (1 - R)) - 2.0) / G  # of a throw downwards with 2 m/s

@@ -202,7 +202,7 @@ def test_what_cannot_be_in_a_file_is_refused_and_nothing_is_written(name, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
-SCENES = sorted((Path(__file__).parent.parent / "experiments" / "scenes").glob("*.toml"))
+SCENES = sorted((Path(__file__).parents[2] / "experiments" / "scenes").glob("*.toml"))
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
@@ -212,7 +212,7 @@ def test_scenes_of_the_repository_load_and_are_read_back(path, tmp_path):
 
 
 def test_garwins_throw_is_that_of_the_design_document():
-    file = load_scene(Path(__file__).parent.parent / "experiments" / "scenes" / "under_the_table.toml")
+    file = load_scene(Path(__file__).parents[2] / "experiments" / "scenes" / "under_the_table.toml")
     assert file.scene.names == ("floor", "table")
     assert file.throw.velocity.tolist() == [2.0, 0.0, -5.0]
     assert file.simulate == SimulateTask(2.0, 0.0, 16)
