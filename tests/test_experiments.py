@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from report import Check, table
 
-SCRIPTS = sorted(path.stem for path in (pathlib.Path(__file__).parents[1] / "experiments").glob("[0-9]*.py"))
+SCRIPTS = sorted(path.stem for path in (pathlib.Path(__file__).parents[1] / "experiments").glob("*/[0-9]*.py"))
 
 
 def script(start):

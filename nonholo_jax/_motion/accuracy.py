@@ -1,10 +1,10 @@
 """The cheapest motion that is expected to reach an error.
 
-The numbers are fitted to the throws of `experiments/bench_accuracy.py`: 1,000 in each of five scenes with air, a few
-metres wide and 0.7 to 4 s long. There the error at the end that 99 of 100 throws stay below is at most `_GROWTH`
-max(1, T)^3 times the absolute tolerance of one step for Tsit5, with T the duration in seconds. With Dopri8, whose
-interpolant has a lower order than its steps, it is moreover at most `_BETWEEN` max(1, T)^3 times the power 3/4 of that
-tolerance.
+The numbers are fitted to the throws of `experiments/benchmarks/bench_accuracy.py`: 1,000 in each of five scenes with
+air, a few metres wide and 0.7 to 4 s long. There the error at the end that 99 of 100 throws stay below is at most
+`_GROWTH` max(1, T)^3 times the absolute tolerance of one step for Tsit5, with T the duration in seconds. With Dopri8,
+whose interpolant has a lower order than its steps, it is moreover at most `_BETWEEN` max(1, T)^3 times the power 3/4 of
+that tolerance.
 """
 
 from typing import Any

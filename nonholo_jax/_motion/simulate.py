@@ -63,7 +63,7 @@ def simulate(
         with air, a gap of unknown curvature, or friction on a slope, across which a ball slides along a curve.
     - `accuracy`: instead of `motion`, the error of the final position, in m, that is wanted: a Python number > 0. Picks
         `Exact()` where the scene allows it, else solver and tolerances that 99 of 100 throws of
-        `experiments/bench_accuracy.py` reach it with; an expectation, no bound. Grazing throws may miss it.
+        `experiments/benchmarks/bench_accuracy.py` reach it with; an expectation, no bound. Grazing throws may miss it.
     - `sum_trains`: bounces on a plane that die out before anything else can happen are summed in closed form, as one
         row of the log, and the ball goes on rolling (on a `Smooth` surface sliding, on a `Frictional` one sliding until
         it rolls). False gives every bounce, and ends as `RESULTS.sustained_contact` where they have died out.

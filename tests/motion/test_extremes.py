@@ -1,4 +1,4 @@
-"""Random scenes and extreme throws, in a small version of experiments/extremes.py, and what that study has found."""
+"""Random scenes and extreme throws, in a small version of experiments/extremes, and what that study has found."""
 
 import extremes_long
 import extremes_throws

@@ -5,6 +5,8 @@ machine's eps; the formulas as the paper prints them are evaluated in a longer f
 NumPy's longdouble). Once in float64, once in float32. Exit code 1 if a line fails."""
 
 import argparse
+import pathlib
+import sys
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import systems
-from report import Check, table
 
 from nonholo_jax import (
     Ball,
@@ -29,6 +30,9 @@ from nonholo_jax import (
     slip,
     weak_residual,
 )
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import Check, table
 
 
 class Draw(NamedTuple):

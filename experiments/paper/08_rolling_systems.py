@@ -5,16 +5,20 @@ the energy at several step sizes.
 Picture: each path, free and against its wall, and the error of the energy against the step."""
 
 import argparse
+import pathlib
+import sys
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, Check, figure, residuals, save, table
 from systems import SystemCase, all_systems
 
 from nonholo_jax import Integrated, LagrangianSystem, simulate
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, Check, figure, residuals, save, table
 
 NAME = "rolling_systems"
 NAMES = ("sleigh", "disk", "knife", "turntable", "cylinder")

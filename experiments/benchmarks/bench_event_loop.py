@@ -8,7 +8,7 @@ A ball with drag and Magnus force between a floor and a ceiling, many different 
 float64. All ways use Tsit5 with the same tolerances; errors of the final position are against a run at 1e-12. The
 times are medians of interleaved runs after compilation, so that a busy machine slows both.
 
-    python experiments/bench_event_loop.py [--throws 4096] [--runs 5] [--json FILE]
+    python experiments/benchmarks/bench_event_loop.py [--throws 4096] [--runs 5] [--json FILE]
 """
 
 import argparse

@@ -7,7 +7,7 @@ impact or the two hit other surfaces; these are counted and left out of "reached
 Tsit5, Dopri5 and Dopri8 over rtol = atol = 1e-2 to 1e-13 whose error is below the wanted one for 99 of 100 of the
 same throws. Times are medians after compilation, interleaved over all of a scene.
 
-    python experiments/bench_accuracy.py [--throws 1000] [--runs 5] [--seed 0] [--json FILE]
+    python experiments/benchmarks/bench_accuracy.py [--throws 1000] [--runs 5] [--seed 0] [--json FILE]
 
 Ends with exit code 1 if fewer than 99 % of the throws that do not graze reached an error.
 """
@@ -23,10 +23,12 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import machine
 
 from nonholo_jax import RESULTS, Air, Ball, BallState, Cylinder, Integrated, Plane, Rough, Scene, Sphere, simulate_batch
 from nonholo_jax.scene_file import load_scene
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import machine
 
 jax.config.update("jax_enable_x64", True)
 
@@ -62,7 +64,7 @@ def cases(n: int, seed: int = 0) -> dict[str, Case]:
         for axis, (x, y) in {"x": (1.0, 0.0), "y": (0.0, 1.0)}.items()
         for sign in (1, -1)
     }
-    table = load_scene(pathlib.Path(__file__).parent / "scenes" / "superball_under_table.toml")
+    table = load_scene(pathlib.Path(__file__).parents[1] / "scenes" / "superball_under_table.toml")
     keys = jax.random.split(jax.random.key(first + 1))
     aimed = BallState(
         jnp.broadcast_to(table.throw.position, (n, 3)),

@@ -3,10 +3,12 @@ weak form and the law see of planted errors.
 
 Picture: both paths, and how far apart they are."""
 
+import pathlib
+import sys
+
 import equinox as eqx
 import jax
 import numpy as np
-from report import BLUE, FAINT, INK, VERMILION, Check, figure, residuals, save, table
 from systems import ALPHA, G, J, M, R, diagonal, floor_of_normals, thrown_ball
 
 from nonholo_jax import (
@@ -22,6 +24,9 @@ from nonholo_jax import (
     simulate,
     weak_residual,
 )
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import BLUE, FAINT, INK, VERMILION, Check, figure, residuals, save, table
 
 NAME = "thrown_ball"
 MU = 0.9

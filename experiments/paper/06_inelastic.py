@@ -3,15 +3,19 @@ paper, by B, and by the ball engine, one batch over scenes.
 
 Picture: the paths, and what each component of the velocity does."""
 
+import pathlib
+import sys
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, Check, figure, residuals, save, table
 from systems import ALPHA, G, J, M, R, thrown_ball
 
 from nonholo_jax import Ball, BallState, Integrated, Plane, Rough, Scene, collide, projector, simulate, simulate_batch
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, Check, figure, residuals, save, table
 
 NAME = "inelastic"
 VELOCITY, SPIN = np.array([1.0, -0.5, -2.0]), np.array([3.0, -20.0, 5.0])

@@ -4,7 +4,7 @@
 compared, byte for byte, with that of an undisturbed run. `places`: the same throws on 1, 2 and 4 devices, by 1 and 2
 processes, in chunks of 1,000 and of 65,536, compared throw by throw with the first of these.
 
-    python experiments/montecarlo_anywhere.py [--sections kills,places] [--throws N] [--kills 10] [--seed 0]
+    python experiments/studies/montecarlo_anywhere.py [--sections kills,places] [--throws N] [--kills 10] [--seed 0]
 """
 
 import argparse
@@ -19,11 +19,13 @@ import tempfile
 import time
 
 import numpy as np
-from report import Check, table
 
 from nonholo_jax import Ensemble
 
-SCENE = pathlib.Path(__file__).parent / "scenes" / "superball_under_table.toml"
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import Check, table
+
+SCENE = pathlib.Path(__file__).parents[1] / "scenes" / "superball_under_table.toml"
 QUANTITIES = ("distance", "second_landing.x", "second_landing.y")
 THROWS = {"kills": 1_000_000, "places": 131_072}
 CHUNK_OF_KILLS = 4096

@@ -12,6 +12,8 @@ after pi / sqrt(k), for every k. What else happens during the contact spoils tha
 
 Picture: the error against the stiffness, and the contact of the rough ball at three of them."""
 
+import pathlib
+import sys
 from typing import Any, NamedTuple
 
 import diffrax
@@ -19,10 +21,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from report import BLUE, GREEN, INK, ORANGE, VERMILION, Check, figure, save, table
 from systems import M, R, diagonal, floor_of_normals, sleigh, thrown_ball
 
 from nonholo_jax import Barrier, LagrangianSystem, collide
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import BLUE, GREEN, INK, ORANGE, VERMILION, Check, figure, save, table
 
 NAME = "stiff_wall"
 NOISE = 1e-9  # of the end of the contact, as it is found

@@ -3,14 +3,19 @@ equal balls head-on without spin exchange their velocities.
 
 Picture: the paths of the two and of their centre of mass, and what passes from one to the other."""
 
+import pathlib
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import BLUE, FAINT, INK, VERMILION, Check, figure, residuals, save, table
 from systems import J, M, R, two_balls
 
 from nonholo_jax import Integrated, LagrangianSystem, Trajectory, simulate
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import BLUE, FAINT, INK, VERMILION, Check, figure, residuals, save, table
 
 NAME = "two_balls"
 FINE = Integrated(rtol=1e-11, atol=1e-11)

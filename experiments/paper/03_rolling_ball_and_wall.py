@@ -2,15 +2,19 @@
 
 Picture: seen from above, the pivot spin omega_3 that the ball comes with decides where it goes."""
 
+import pathlib
+import sys
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, Check, figure, residuals, save, table
 from systems import ALPHA, J, M, R, rolling_ball
 
 from nonholo_jax import Ball, BallState, Integrated, Plane, Rough, Scene, simulate, simulate_batch
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import BLUE, FAINT, GREEN, INK, ORANGE, PURPLE, VERMILION, Check, figure, residuals, save, table
 
 NAME = "rolling_ball_and_wall"
 V1, V2, START = -1.5, 0.7, 1.0

@@ -5,7 +5,7 @@ wood, emery cloth and Rebound Ace (data/cross2002_tennis.csv, through a transcri
 squares through the simulator to both components of the velocity and to the spin times the radius, six numbers, whose
 common spread is not known. Models are compared by Akaike's criterion for few data (AICc), undecided within 2.
 
-    python experiments/10_tennis_bounces.py [--out DIR]
+    python experiments/studies/10_tennis_bounces.py [--out DIR]
 """
 
 import argparse
@@ -16,14 +16,16 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import Check, table
 
 from nonholo_jax import Ball, BallState, Frictional, Plane, Rough, Scene, compare, fit
 from nonholo_jax.plot import plot_fits
 
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import Check, table
+
 jax.config.update("jax_enable_x64", True)
 
-HERE = pathlib.Path(__file__).parent
+DATA = pathlib.Path(__file__).parents[1] / "data"
 RADIUS, MASS = 0.033, 0.057
 INERTIA_RATIO = 0.55  # of a tennis ball, a thick shell (Cross)
 LAW = "surfaces.ground.law."
@@ -36,7 +38,7 @@ LAWS = {
 
 
 def _rows() -> list[dict]:
-    lines = [line for line in (HERE / "data/cross2002_tennis.csv").read_text().splitlines() if not line.startswith("#")]
+    lines = [line for line in (DATA / "cross2002_tennis.csv").read_text().splitlines() if not line.startswith("#")]
     return [{k: x if k == "surface" else float(x) for k, x in row.items()} for row in csv.DictReader(lines)]
 
 

@@ -6,7 +6,7 @@ scene, velocities in units of the fastest one, spins times the radius; derivativ
 (x df/dx), in the same units, forward and reverse mode both. The bound of a cell is what `ROUNDINGS` (16) roundings of
 each input do to the truth, and as many roundings of the answer: an answer may not be worse than its inputs are.
 
-    python experiments/extremes.py [--throws 100000] [--json FILE]
+    python experiments/extremes/extremes.py [--throws 100000] [--json FILE]
 
 prints the table and the random study (`random_scenes.py`); exit code 1 if a cell breaks its bound, holds a NaN under a
 result that is none, tunnels, or does not end.
@@ -25,6 +25,8 @@ import numpy as np
 from extremes_long import ROWS
 from extremes_throws import COLUMNS, DTYPES, families, judged, with_slopes, worst
 from random_scenes import GAIN, NAMED, OK, TEMPLATES, Found, Template, study
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
 from report import machine
 
 

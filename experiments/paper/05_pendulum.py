@@ -3,13 +3,18 @@ parabola, there and back, for ever.
 
 Picture: the parabola with what reverses at its ends, and how far from the first two places the ball still bounces."""
 
+import pathlib
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from report import BLUE, FAINT, INK, VERMILION, Check, figure, residuals, save, table
 from systems import ALPHA, G, J, M, R, thrown_ball
 
 from nonholo_jax import Ball, BallState, Integrated, Plane, Rough, Scene, Trajectory, energy, simulate
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import BLUE, FAINT, INK, VERMILION, Check, figure, residuals, save, table
 
 NAME = "pendulum"
 V, U = 0.4, 1.1  # m/s along and up

@@ -4,13 +4,14 @@ The base is a rough elastic ball on a floor, 1.5 s, without a log; every other l
 operations the compiled program has, compilation time, and time per throw, as a ratio to the base, by turns. Beside them
 a minimal function of JAX, written by hand for that one scene, for the same bounces.
 
-    python experiments/bench_scene_cost.py [--throws 65536] [--runs 7] [--json FILE]
+    python experiments/benchmarks/bench_scene_cost.py [--throws 65536] [--runs 7] [--json FILE]
 """
 
 import argparse
 import json
 import pathlib
 import re
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from report import machine
 from throughput_shared import by_turns
 
 from nonholo_jax import (
@@ -33,6 +33,9 @@ from nonholo_jax import (
     Scene,
     simulate_batch,
 )
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import machine
 
 jax.config.update("jax_enable_x64", True)
 

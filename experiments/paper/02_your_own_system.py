@@ -3,11 +3,16 @@
 q = (x, y, heading, left wheel, right wheel); (x, y) is the middle of the axle and x goes down the ramp. The wheels
 neither slip nor skid; the centre of mass is ahead of the axle, on a castor that is free to swivel."""
 
+import pathlib
+import sys
+
 import jax
 import jax.numpy as jnp
-from report import Check, table
 
 from nonholo_jax import Barrier, Integrated, LagrangianSystem, energy, law_residual, simulate, weak_residual
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import Check, table
 
 
 def cart(restitution, wheel=0.05, half_axle=0.15, centre=0.08, nose=0.2):

@@ -12,24 +12,27 @@ On an accelerator the C programs are left out. With what the device can do at mo
 if given, of float64) and bytes a second of its memory, rows that bounce between floor and ceiling say what part of it
 they reach, at the operations of bounces.c and one passage of the state through memory for every bounce.
 
-    python experiments/bench_throughput.py [--sections limit,table] [--throws 1048576] [--runs 5] [--json FILE]
-        [--peak-flops FLOAT32 [FLOAT64]] [--peak-bytes BYTES]
+    python experiments/benchmarks/bench_throughput.py [--sections limit,table] [--throws 1048576] [--runs 5]
+        [--json FILE] [--peak-flops FLOAT32 [FLOAT64]] [--peak-bytes BYTES]
 """
 
 import argparse
 import json
 import os
 import pathlib
+import sys
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-from report import machine
 from throughput_bounces import limit, table
 from throughput_gradient import gradient
 from throughput_integrated import integrated
 from throughput_peers import peers
 from throughput_scaling import scaling
+
+sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
+from report import machine
 
 
 class Section(NamedTuple):

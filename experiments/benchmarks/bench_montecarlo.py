@@ -4,7 +4,7 @@ For scenes with a [monte_carlo] table: throws a second of `simulate_batch` alone
 log, what varies of the scene mapped, in batches of the size of a chunk; of `monte_carlo` without and with a folder; by
 turns, on one device and, in a process of its own, on as many as there are cores.
 
-    python experiments/bench_montecarlo.py [--throws 262144] [--runs 3] [--devices N]
+    python experiments/benchmarks/bench_montecarlo.py [--throws 262144] [--runs 3] [--devices N]
 """
 
 import argparse
@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 
-HERE = pathlib.Path(__file__).parent
+EXPERIMENTS = pathlib.Path(__file__).parents[1]
 SCENES = ("superball_under_table", "table_tennis_serve")
 CHUNK = 16_384
 
@@ -29,7 +29,7 @@ def measure(n: int, runs: int) -> None:
     from nonholo_jax.scene_file import load_scene
 
     for name in SCENES:
-        file = load_scene(HERE / "scenes" / f"{name}.toml")
+        file = load_scene(EXPERIMENTS / "scenes" / f"{name}.toml")
         assert file.monte_carlo is not None and file.simulate is not None
         sampler, how = file.monte_carlo.sampler, file.simulate.arguments
         arguments = {**file.monte_carlo.arguments, **how, "n": n, "chunk": CHUNK}
@@ -84,6 +84,7 @@ def main() -> None:
     if options.devices is not None:
         measure(options.throws, options.runs)
         return
+    sys.path.append(str(EXPERIMENTS))  # for report.py
     from report import machine
 
     print(f"{machine()}, {options.throws} throws, chunks of {CHUNK}", flush=True)
