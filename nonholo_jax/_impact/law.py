@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import equinox as eqx
 
-from .._math import Number, as_number, is_constant, minimum, plus, ratio, root, times, where_number
+from .._math import Number, as_number, is_constant, minimum, plus, ratio, root, times, where
 
 
 class AbstractContactLaw(eqx.Module):
@@ -154,7 +154,7 @@ class Frictional(AbstractContactLaw):
         """0 for e_t = -1: then no impact of a train touches the slip, however slow."""
         if is_constant(self.tangential):
             return self.friction if self.tangential > -1 else 0.0
-        return where_number(self.tangential > -1, self.friction, 0.0)
+        return where(self.tangential > -1, self.friction, 0.0)
 
     def admissible(self) -> list:
         sentence = f"`friction` must not be negative, but got {self.friction}; 0 is a smooth wall"

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from .._math import Number, Vector3, add, cross, dot, norm, plus, ratio, scale, subtract, times, where_number
+from .._math import Number, Vector3, add, cross, dot, norm, plus, ratio, scale, subtract, times, where
 
 NONE: Vector3 = (0.0, 0.0, 0.0)
 
@@ -33,7 +33,7 @@ def own_slip(radius: Number, normal: Vector3, velocity: Vector3, spin: Vector3) 
     slip = subtract(tangential, scale(radius, cross(spin, normal)))
     eps = float(jnp.finfo(jnp.result_type(*velocity)).eps)
     slips = norm(slip) > 64.0 * eps * (norm(tangential) + radius * norm(spin))
-    return tuple(where_number(slips, u, 0.0) for u in slip)  # pyright: ignore
+    return tuple(where(slips, u, 0.0) for u in slip)  # pyright: ignore
 
 
 def heading(slip: Vector3, along: Vector3, most: Number) -> Vector3:

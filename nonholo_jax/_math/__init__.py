@@ -41,11 +41,13 @@ from .types import (
     surfaces_hit as surfaces_hit,
 )
 from .vector import (
+    Choice as Choice,
     add as add,
     as_number as as_number,
     as_pair as as_pair,
     as_quaternion as as_quaternion,
     as_vector as as_vector,
+    beyond as beyond,
     components as components,
     cross as cross,
     dot as dot,
@@ -59,12 +61,11 @@ from .vector import (
     ratio as ratio,
     root as root,
     scale as scale,
-    select as select,
-    select_vector as select_vector,
     slope as slope,
     subtract as subtract,
     times as times,
     total as total,
     unit as unit,
-    where_number as where_number,
+    where as where,
+    where_vector as where_vector,
 )

@@ -1,12 +1,15 @@
 """Arithmetic on triples of scalars that drops what is known to be zero or one when the program is traced."""
 
+import functools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from .types import Number, Numbers, Vector3
@@ -115,11 +118,25 @@ def cross(a: Vector3, b: Vector3) -> Vector3:
     )
 
 
-def where_number(condition: Any, a: Number, b: Number) -> Number:
-    """`jnp.where` that keeps a constant when both branches are the same one."""
-    if is_constant(a) and is_constant(b) and a == b:
+def where(condition: Any, a: Numbers, b: Numbers) -> Any:
+    """`jnp.where` of numbers in as few operations as it takes: none where the condition or the answer is known."""
+    if isinstance(condition, bool | np.bool_):
+        return a if condition else b
+    if a is b or (is_constant(a) and is_constant(b) and a == b):
         return a
-    return jnp.where(condition, a, b)
+    if is_constant(a) and is_constant(b):
+        return jnp.where(condition, a, b)
+    arrays = [x for x in (a, b) if not is_constant(x)]
+    dtype, shape = jnp.result_type(*arrays), jnp.shape(condition)
+    if any(jnp.shape(x) != shape or x.dtype != dtype or getattr(x, "weak_type", False) for x in arrays):
+        return jnp.where(condition, a, b)
+    a, b = (np.full(shape, x, dtype)[()] if is_constant(x) else x for x in (a, b))
+    return lax.select(condition, a, b)
+
+
+def where_vector(condition: Any, a: Sequence[Numbers], b: Sequence[Numbers]) -> Any:
+    """`where`, component by component."""
+    return tuple(where(condition, x, y) for x, y in zip(a, b, strict=True))
 
 
 def minimum(a: Number, b: Number) -> Number:
@@ -136,15 +153,17 @@ def root(x: Number) -> Number:
         return math.sqrt(max(x, 0.0))
     positive = x > 0
     # The double where: the inner one keeps 1/(2 sqrt(0)) = inf out of the derivative, where inf * 0 would be NaN.
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+    return where(positive, jnp.sqrt(where(positive, x, 1.0)), 0.0)
 
 
 def ratio(a: Number, b: Number, otherwise: Number = 0.0) -> Number:
     """a / b, and `otherwise` where b is zero, with finite derivatives everywhere."""
     if is_constant(b):
         return times(a, 1.0 / b) if b != 0 else otherwise
+    if is_constant(a) and a == 0 and is_constant(otherwise) and otherwise == 0:
+        return 0.0
     usable = b != 0
-    return jnp.where(usable, a / jnp.where(usable, b, 1.0), otherwise)
+    return where(usable, a / where(usable, b, 1.0), otherwise)
 
 
 def norm(a: Sequence) -> Number:
@@ -154,19 +173,45 @@ def norm(a: Sequence) -> Number:
 def unit(a: Sequence) -> Any:
     """The direction of a vector; exact for the axes."""
     length = norm(a)
-    return tuple(a) if is_constant(length) and length == 1 else tuple(ratio(x, length) for x in a)
+    if is_constant(length):
+        return tuple(a) if length == 1 else tuple(ratio(x, length) for x in a)
+    length = where(length != 0, length, 1.0)
+    return tuple(0.0 if is_constant(x) and x == 0 else x / length for x in a)
 
 
-def select(index: Any, options: Sequence[Number]) -> Number:
-    """options[index] for a traced index, folded where all options are the same constant."""
-    result = options[-1]
-    for i in range(len(options) - 2, -1, -1):
-        result = where_number(index == i, options[i], result)
-    return result
+def beyond(x: Number, bound: Number) -> Number:
+    """By how much x exceeds a bound, or zero."""
+    excess = plus(x, times(-1.0, bound))
+    return max(excess, 0.0) if is_constant(excess) else where(excess <= 0, 0.0, excess)
 
 
-def select_vector(index: Any, options: Sequence[Vector3]) -> Any:
-    return tuple(select(index, [option[axis] for option in options]) for axis in range(3))
+class Choice:
+    """One of `count` things by a traced index, whose comparisons are made once, however much is chosen by them."""
+
+    def __init__(self, index: Any, count: int):
+        self.index = index
+        self._flags = [index == i for i in range(count)]
+
+    def is_(self, i: int) -> Any:
+        """Whether it is number i."""
+        return self._flags[i]
+
+    def among(self, numbers: Sequence[int]) -> Any:
+        """Whether it is one of these."""
+        return functools.reduce(operator.or_, [self._flags[i] for i in numbers], False)
+
+    def of(self, options: Sequence[Number], numbers: Sequence[int] | None = None) -> Any:
+        """The option of that number, and the last one for any number that has none; `numbers` are those of the options
+        if they are not counted from 0. Folded where all options are the same constant."""
+        known = list(zip(range(len(options)) if numbers is None else numbers, options, strict=True))
+        result = known[-1][1]
+        for i, option in known[-2::-1]:
+            result = where(self._flags[i], option, result)
+        return result
+
+    def vector(self, options: Sequence[Sequence[Number]], numbers: Sequence[int] | None = None) -> Any:
+        """`of`, component by component."""
+        return tuple(self.of(column, numbers) for column in zip(*options, strict=True))
 
 
 def slope(function: Callable, at: Sequence, along: Sequence) -> tuple[Number, Number]:

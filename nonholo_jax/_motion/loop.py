@@ -11,11 +11,12 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
-from .._math import KINDS, RESULTS, frozen, norm, shared
-from .._world import ENDS, FULL, PAUSES, AbstractSystem, Hopper
-from .crossing import meeting, newton, search
+from .._math import KINDS, RESULTS, Choice, frozen, norm, shared, total, where
+from .._world import ENDS, FULL, PAUSES, AbstractSystem, Hopper, Meeting
+from .crossing import corrected, search
 from .motion import AbstractMotion
 
 _MOST_IMPACTS_AT_ONCE = 32
@@ -136,7 +137,7 @@ def _shared_flags(flags: tuple) -> list:
 
 
 def keep(condition: Any, new: Any, old: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+    return jax.tree.map(lambda a, b: where(condition, a, b), new, old)
 
 
 def start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> Carry:
@@ -166,93 +167,86 @@ def start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> Carry
     )
 
 
-def turn(c: Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, max_impacts: int) -> Carry:
-    """One turn: search one arc a little further; where that ends it, finish it."""
-    left = t1 - c.time + c.ahead
-    size = jnp.where(c.done, 1.0, motion.size(c.control, left))  # finished lanes compute harmless numbers
+def turn(
+    c: Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, max_impacts: int, differentiable: bool = False
+) -> Carry:
+    """One turn: search one arc a little further; where that ends it, finish it. `differentiable` turns have derivatives
+    of their own."""
+    active, left = ~c.done, t1 - c.time + c.ahead
+    size = where(active, motion.size(c.control, left), 1.0)  # finished lanes compute harmless numbers
     last = size >= left
-    length = jnp.where(last, left, frozen(size))
+    length = where(last, left, frozen(size))
     begun = system.prepared(c.time, c.state)
     piece = motion.piece(system, c.time, begun, c.memory, c.jumped, length)
     arc = piece.arc
     kept, control = motion.judge(c.control, size, piece.trial)
     found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
     kept, finished = _shared_flags((kept, found.finished))
-    ended = kept & finished
+    ended = active & kept & finished
     crossed = ended & (found.contact >= 0)
     through = ended & ~crossed
-    s, resting, ends = jnp.where(through, arc.length, found.s), jnp.asarray(False), jnp.asarray(False)
-    if system.n_contacts > 0:
-        met = meeting(system, arc, found.s, found.contact)
-        s, resting, ends = jnp.where(crossed, newton(arc, s, met.value, met.rate, met.noise), s), met.rests, met.ends
-        (s,) = shared([s])
+    contact = Choice(found.contact, system.n_contacts)
+    s = where(through, arc.length, found.s)
+    if differentiable and system.n_contacts > 0:
+        s = where(crossed, corrected(system, arc, s, contact), s)
+    (s,) = shared([s])
     elapsed = s * arc.unit
     reached = through & last
     time, ahead = later(c.time, c.ahead, elapsed)
-    time = jnp.where(reached, t1, time)
+    time = where(reached, t1, time)
     arrived = as_arrays(system.advanced(time, begun, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
     arrived = computed_once(arrived)
 
-    since = c.since + elapsed
-    at_once = since * norm(frozen(arc.tangent(s))) <= _tiny(arc, s) * arc.unit
+    since, speed = c.since + elapsed, norm(frozen(arc.tangent(s)))
+    at_once = since * speed <= _tiny(arc, s) * arc.unit
     same = found.contact == c.touching  # bounces on one surface die out, they are no corner
-    n_at_once = jnp.where(at_once & (c.n_impacts > 0) & ~same, c.n_at_once + 1, 0)
-    full = c.n_impacts >= max_impacts
-    stuck = n_at_once > _MOST_IMPACTS_AT_ONCE
-    kind, fault, after, pause, name = KINDS.unused, RESULTS.reached_t1, arrived, 0.0, found.contact
+    n_at_once = where(at_once & (c.n_impacts > 0) & ~same, c.n_at_once + 1, 0)
+    full, stuck = c.n_impacts >= max_impacts, n_at_once > _MOST_IMPACTS_AT_ONCE
+    met, name = Meeting(KINDS.unused, RESULTS.reached_t1, arrived, 0.0, False), found.contact
     if system.n_contacts > 0:
-        name = system.named(found.contact, arrived)
-        bounced = system.bounced(found.contact, time, arrived)
-        kind, fault = system.follows(found.contact, time, arrived, bounced, t1 - time, resting, ends)
-        after, pause = system.impact(found.contact, time, arrived, bounced, kind)
-        after = as_arrays(after, t1.dtype)
-    failed = fault != RESULTS.reached_t1
+        name = system.named(contact, arrived)
+        met = system.meets(contact, time, arrived, t1 - time, *found.rests(speed))
+    after = as_arrays(met.after, t1.dtype)
+    failed = met.fault != RESULTS.reached_t1
     stopped = crossed & (failed | full | stuck)
     stopped, crossed = _shared_flags((stopped, crossed))
     struck = crossed & ~stopped
-    until = time + pause
-    settled = struck & system.is_at_rest(found.contact, time, arrived, after)
-    row, labels = Row(time, until, since, arrived, after), jnp.stack([name, _code(kind), system.phase(after)])
-    log = _written(c.log, c.n_impacts, struck & ~c.done, pack_row(row), labels)
-    sizes = frozen(jnp.stack([jnp.where(last, jnp.inf, length), s]))
+    until, settled = time + met.pause, struck & met.is_at_rest
+    row, labels = Row(time, until, since, arrived, after), jnp.stack([name, _code(met.kind), system.phase(after)])
+    log = _written(c.log, c.n_impacts, struck, pack_row(row), labels)
+    sizes = frozen(jnp.stack([where(last, jnp.inf, length), s]))
     place = c.n_arcs % max(c.path.labels.shape[0], 1)
-    path = _written(c.path, place, ended & ~c.done, sizes, jnp.stack([found.contact, labels[1]]))
+    path = _written(c.path, place, ended, sizes, jnp.stack([found.contact, labels[1]]))
 
-    broken = ended & ~jnp.isfinite(time + sum(arrived_leaf.sum() for arrived_leaf in jax.tree.leaves(arrived)))
+    broken = ended & ~jnp.isfinite(total([time, *jax.tree.leaves(jax.tree.map(jnp.sum, arrived))]))
     (broken,) = _shared_flags((broken,))
     n_arcs = c.n_arcs + ended.astype(jnp.int32)
     exhausted = (c.n_turns + 1 >= motion.max_turns(max_impacts)) | (n_arcs >= motion.max_pieces(max_impacts))
-    exhausted = exhausted & ~(reached | stopped | settled | broken)
-    cases = [(crossed & full, RESULTS.max_impacts), (crossed & stuck, RESULTS.corner), (crossed & failed, fault),
+    exhausted = active & exhausted & ~(reached | stopped | settled | broken)
+    cases = [(crossed & full, RESULTS.max_impacts), (crossed & stuck, RESULTS.corner), (crossed & failed, met.fault),
              (settled, RESULTS.at_rest), (broken, RESULTS.invalid_state), (exhausted, RESULTS.step_limit)]  # fmt: skip
-    result = functools.reduce(lambda result, case: RESULTS.where(*case, result), cases, c.result)
-    new = c._replace(
-        time=jnp.where(struck, until, jnp.where(ended, time, c.time)),
-        ahead=jnp.where(ended, ahead, c.ahead),
-        state=keep(ended, keep(struck, after, arrived), c.state),
+    code = functools.reduce(lambda code, case: where(case[0], case[1]._value, code), cases, c.result._value)
+    goes_on = kept & ~ended
+    return c._replace(
+        time=where(struck, until, where(ended, time, c.time)),
+        ahead=where(ended, ahead, c.ahead),
+        state=keep(struck, after, keep(ended, arrived, c.state)),
         memory=keep(ended, piece.memory, c.memory),
-        s=jnp.where(kept & ~ended, frozen(found.s), 0.0),
-        window=jnp.where(kept & ~ended, frozen(found.window), jnp.inf),
-        touching=jnp.where(struck, name, jnp.where(through, -1, c.touching)),
-        jumped=jnp.where(ended, struck, c.jumped),
+        s=where(goes_on, frozen(found.s), 0.0),
+        window=where(goes_on, frozen(found.window), jnp.inf),
+        touching=where(struck, name, where(through, np.int32(-1), c.touching)),
+        jumped=where(ended, struck, c.jumped),
         control=keep(ended | ~kept, control, c.control),
-        since=jnp.where(struck, 0.0, jnp.where(ended, since, c.since)),
+        since=where(struck, 0.0, where(ended, since, c.since)),
         n_impacts=c.n_impacts + struck.astype(jnp.int32),
         n_arcs=n_arcs,
         n_turns=c.n_turns + 1,
-        n_at_once=jnp.where(struck, n_at_once, c.n_at_once),
-        done=reached | stopped | settled | exhausted | broken,
-        result=result,
+        n_at_once=where(struck, n_at_once, c.n_at_once),
+        done=c.done | reached | stopped | settled | exhausted | broken,
+        result=_result_of(code),
+        log=log,
+        path=path,
     )
-    old = c._replace(log=log, path=path)
-    return _keep_small(c.done, old, new._replace(log=log, path=path))
-
-
-def _keep_small(condition: Any, a: Carry, b: Carry) -> Carry:
-    """`keep` for all but the buffers, which would be copied whole at every turn."""
-    fields = {name: keep(condition, getattr(a, name), getattr(b, name))
-              for name in Carry._fields if name not in ("log", "path")}  # fmt: skip
-    return Carry(log=a.log, path=a.path, **fields)
 
 
 def later(time: Any, ahead: Any, elapsed: Any) -> tuple[Any, Any]:
@@ -265,6 +259,10 @@ def later(time: Any, ahead: Any, elapsed: Any) -> tuple[Any, Any]:
 
 def _code(kind: Any) -> Any:
     return jnp.asarray(kind._value, dtype=jnp.int32)
+
+
+def _result_of(code: Any) -> RESULTS:
+    return eqx.tree_at(lambda result: result._value, RESULTS.reached_t1, code)
 
 
 def kind_of(code: Any) -> KINDS:
@@ -314,15 +312,15 @@ def _hops(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows:
     def hop(c: _Hopping) -> _Hopping:
         going, full = c.mark >= -1, c.turn >= max_impacts - carry.n_impacts
         done = hopper.first(c.mark, going, full, t1 - c.time + c.ahead, c.state)
-        why = jnp.where(done.choice == ENDS, 0, jnp.where(done.choice <= FULL, 1, 2))
+        why = where(done.choice == ENDS, 0, where(done.choice <= FULL, 1, 2))
         stop = _stopped(c.turn, jnp.maximum(c.mark, -1), why, bits)
-        mark = jnp.where(done.choice >= 0, done.choice.astype(jnp.int32), jnp.where(going, stop, c.mark))
+        mark = where(done.choice >= 0, done.choice.astype(jnp.int32), where(going, stop, c.mark))
         time, ahead = later(c.time, c.ahead, done.duration)
         path = c.path.at[c.turn].set(done.choice.astype(c.path.dtype)) if rows else c.path
         return _Hopping(time, ahead, done.state, mark, c.turn + 1, path)
 
     zero = jnp.asarray(0, dtype=jnp.int32)
-    mark = jnp.where(_can_start(carry, system), carry.touching, _stopped(zero, -1, 2, bits))
+    mark = where(_can_start(carry, system), carry.touching, _stopped(zero, -1, 2, bits))
     path = jnp.full((rows,), int(PAUSES), jnp.int16)
     begin = _Hopping(carry.time, carry.ahead, carry.state, mark, zero, path)
     return lax.while_loop(lambda c: eqxi.unvmap_any(c.mark >= -1), hop, begin)
@@ -338,16 +336,16 @@ def _landed(carry: Carry, end: _Hopping, system: AbstractSystem, t1: Any) -> Car
     n_impacts, touching, why = _unmarked(end.mark, system.n_contacts.bit_length())
     reached, full, moved = free & (why == 0), free & (why == 1), n_impacts > 0
     return carry._replace(
-        time=jnp.where(reached, t1, end.time),
+        time=where(reached, t1, end.time),
         ahead=end.ahead,
         state=end.state,
-        window=jnp.where(moved, jnp.inf, carry.window),
-        touching=jnp.where(free, touching, carry.touching),
+        window=where(moved, jnp.inf, carry.window),
+        touching=where(free, touching, carry.touching),
         jumped=carry.jumped | moved,
-        since=jnp.where(moved, 0.0, carry.since),
+        since=where(moved, 0.0, carry.since),
         n_impacts=carry.n_impacts + n_impacts,
         n_arcs=carry.n_arcs + n_impacts + (reached | full).astype(jnp.int32),
-        n_at_once=jnp.where(moved, 0, carry.n_at_once),
+        n_at_once=where(moved, 0, carry.n_at_once),
         done=carry.done | reached | full,
         result=RESULTS.where(full, RESULTS.max_impacts, carry.result),
     )
@@ -363,12 +361,13 @@ def _turned(c: Carry, system, motion, t1, max_impacts: int) -> Carry:
     return hopped(turn(c, system, motion, t1, max_impacts), system, t1, max_impacts)[0]
 
 
-def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = "lax") -> Outcome:
-    """Run the loop. `kind` says how the loop itself may be differentiated: "lax" forward, "checkpointed" in reverse."""
+def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = None) -> Outcome:
+    """Run the loop. `kind` says how the loop itself may be differentiated: `None` not at all, "lax" forward,
+    "checkpointed" in reverse."""
     carry = start(system, motion, state, t0, t1, log_rows, 0)
-    next_turn = lambda c: turn(c, system, motion, t1, max_impacts)  # noqa: E731
+    next_turn = lambda c: turn(c, system, motion, t1, max_impacts, kind is not None)  # noqa: E731
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
-    if kind == "lax":
+    if kind in (None, "lax"):
         end = lax.while_loop(going, next_turn, carry)
     else:
         end = eqxi.while_loop(going, next_turn, carry, kind=kind, max_steps=motion.max_turns(max_impacts))

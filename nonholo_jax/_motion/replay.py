@@ -14,7 +14,18 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._math import RESULTS, Iteration, frozen, in_tiles, shared, tangent_of, unless_batched, where_needed
+from .._math import (
+    RESULTS,
+    Choice,
+    Iteration,
+    frozen,
+    in_tiles,
+    shared,
+    tangent_of,
+    unless_batched,
+    where,
+    where_needed,
+)
 from .._world import ENDS, PAUSES, AbstractSystem
 from .crossing import corrected
 from .loop import (
@@ -73,8 +84,9 @@ def _repeat(r: _Replay, steps: tuple, system, motion, t1: Any, known: Carry) -> 
         piece = motion.piece(system, time, begun, memory, jumped, whole)
         arc = piece.arc
         crossed = used & (contact >= 0)
+        choice = Choice(contact, system.n_contacts)
         if system.n_contacts > 0:
-            (s,) = shared([jnp.where(crossed, corrected(system, arc, s, contact), s)])
+            (s,) = shared([where(crossed, corrected(system, arc, s, choice), s)])
         s = jnp.where(last, arc.length, s)
         s = jnp.where(used, s, 0.0)
         elapsed = s * arc.unit
@@ -85,8 +97,7 @@ def _repeat(r: _Replay, steps: tuple, system, motion, t1: Any, known: Carry) -> 
         struck = crossed & (n_impacts < known.n_impacts)
         after, until = arrived, moved
         if system.n_contacts > 0:
-            bounced = system.bounced(contact, moved, arrived)
-            other, pause = system.impact(contact, moved, arrived, bounced, kind_of(code))
+            other, pause = system.after(choice, moved, arrived, kind_of(code))
             after = keep(struck, as_arrays(other, t1.dtype), arrived)
             until = jnp.where(struck, moved + pause, moved)
         row = pack_row(Row(moved, until, since + elapsed, arrived, after)) if log_rows else jnp.zeros((0,), t1.dtype)
@@ -281,7 +292,7 @@ def run(
     if adjoint is None:
         return _find_or_replay(system, motion, state, t0, t1, **options)
     if isinstance(adjoint, diffrax.ForwardMode):
-        return find(system, motion, state, t0, t1, **options)
+        return find(system, motion, state, t0, t1, kind="lax", **options)
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
         return find(system, motion, state, t0, t1, kind="checkpointed", **options)
     raise ValueError(

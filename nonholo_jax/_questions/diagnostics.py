@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._impact import matmul, projector, whiten
-from .._math import KINDS, RESULTS, select
+from .._math import KINDS, RESULTS, Choice
 from .._motion import Trajectory, run
 from .._world import BallState, LagrangianSystem, Scene, as_arrays
 
@@ -111,9 +111,13 @@ def _ball_row(scene: Scene, contact: Array, time: Array, n: Array, before: Any, 
     x = before.position - ball.radius * n
     moving = jnp.stack([surface.velocity(x, time) for surface in scene.surfaces])[contact]
     closing, slipping = _contact_velocity(scene, before, n, moving)
-    e_n = select(contact, [jnp.asarray(surface.law.restitution, time.dtype) for surface in scene.surfaces])
+    e_n = Choice(contact, len(scene.surfaces)).of(
+        [jnp.asarray(surface.law.restitution, time.dtype) for surface in scene.surfaces]
+    )
     sizes = (ball.inertia_ratio, jnp.abs(closing), jnp.sum(slipping**2))
-    s = select(contact, [jnp.asarray(each.law.slip_factor(*sizes), time.dtype) for each in scene.surfaces])
+    s = Choice(contact, len(scene.surfaces)).of(
+        [jnp.asarray(each.law.slip_factor(*sizes), time.dtype) for each in scene.surfaces]
+    )
     closing_after, slipping_after = _contact_velocity(scene, after, n, moving)
     # An impulse changes the velocity of the contact point by 1 + 1/alpha times what it changes that of the centre.
     miss = (closing_after + e_n * closing) * n + slipping_after - (1 - s * (1 + 1 / ball.inertia_ratio)) * slipping

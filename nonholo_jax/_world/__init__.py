@@ -9,5 +9,5 @@ from .hops import ENDS as ENDS, FULL as FULL, PAUSES as PAUSES, Hopper as Hopper
 from .lagrangian import Barrier as Barrier, LagrangianSystem as LagrangianSystem, as_arrays as as_arrays
 from .round import Cylinder as Cylinder, Sphere as Sphere
 from .scene import Scene as Scene
-from .surface import AbstractSurface as AbstractSurface, Implicit as Implicit, Plane as Plane
-from .system import AbstractSystem as AbstractSystem, rounding as rounding
+from .surface import AbstractSurface as AbstractSurface, Implicit as Implicit, Plane as Plane, Return as Return
+from .system import AbstractSystem as AbstractSystem, Meeting as Meeting, magnitude as magnitude, rounding as rounding

@@ -1,8 +1,8 @@
 """Boxes and rectangles: a ball that touches one has its centre on a box with rounded edges and corners."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -19,6 +19,7 @@ from .._math import (
     as_pair,
     as_quaternion,
     as_vector,
+    beyond,
     components,
     cross,
     dot,
@@ -30,21 +31,19 @@ from .._math import (
     plus,
     ratio,
     scale,
-    select,
-    select_vector,
     square,
     subtract,
     times,
     total,
     unit,
-    where_number,
+    where,
 )
-from .surface import AbstractSurface, Face, check, nonzero, positive
+from .surface import AbstractSurface, Face, Return, check, nonzero, positive
 
 
 def _excess(y: Vector3, half: Vector3) -> Vector3:
     """How far a point in the box's own frame is beyond each pair of faces."""
-    return tuple(maximum(plus(abs(c), times(-1.0, h)), 0.0) for c, h in zip(y, half, strict=True))  # pyright: ignore
+    return tuple(beyond(abs(c), h) for c, h in zip(y, half, strict=True))  # pyright: ignore
 
 
 def _box_distance(y: Vector3, half: Vector3) -> Number:
@@ -55,8 +54,8 @@ def _box_distance(y: Vector3, half: Vector3) -> Number:
 
 def _box_level(y: Vector3, half: Vector3, radius: Number) -> Number:
     """(D - r^2) / 2r with D the squared distance, a sum of three clipped squares: no list of faces, edges, corners."""
-    beyond = _excess(y, half)
-    return ratio(plus(dot(beyond, beyond), times(-1.0, times(radius, radius))), times(2.0, radius))
+    excess = _excess(y, half)
+    return ratio(plus(dot(excess, excess), times(-1.0, times(radius, radius))), times(2.0, radius))
 
 
 def _box_bend(window: Window, axes: tuple, center: Vector3, half: Vector3, radius: Number) -> Interval:
@@ -70,20 +69,19 @@ def _box_bend(window: Window, axes: tuple, center: Vector3, half: Vector3, radiu
         # The excess e grows with the coordinate on the right of the box and against it on the left.
         right, left = value.low > 0, value.high < 0
         either = maximum(abs(bend.low), abs(bend.high))
-        away = where_number(right, bend.high, where_number(left, times(-1.0, bend.low), either))
-        back = where_number(right, times(-1.0, bend.low), where_number(left, bend.high, either))
+        away = where(right, bend.high, where(left, times(-1.0, bend.low), either))
+        back = where(right, times(-1.0, bend.low), where(left, bend.high, either))
         squares = square(rate)
         bend_low = plus(squares.low, times(-1.0, times(farthest, maximum(back, 0.0))))
         # Beyond the edge all along, to rounding: a ball that rolls off must not seem to fall back.
         nearest, slack = maximum(value.low, times(-1.0, value.high)), times(eps, plus(h, abs(dot(axis, center))))
-        lows.append(where_number(plus(nearest, slack) >= h, bend_low, minimum(bend_low, 0.0)))
-        highs.append(where_number(farthest > 0, plus(squares.high, times(farthest, maximum(away, 0.0))), 0.0))
+        lows.append(where(plus(nearest, slack) >= h, bend_low, minimum(bend_low, 0.0)))
+        highs.append(where(farthest > 0, plus(squares.high, times(farthest, maximum(away, 0.0))), 0.0))
     return Interval(ratio(total(lows), radius), ratio(total(highs), radius))
 
 
 def _box_direction(y: Vector3, half: Vector3, axes: tuple) -> Vector3:
-    beyond = [times(e, where_number(c < 0, -1.0, 1.0)) for c, e in zip(y, _excess(y, half), strict=True)]
-    n = unit(beyond)
+    n = unit([where(c < 0, times(-1.0, e), e) for c, e in zip(y, _excess(y, half), strict=True)])
     return add(add(scale(n[0], axes[0]), scale(n[1], axes[1])), scale(n[2], axes[2]))
 
 
@@ -113,6 +111,8 @@ class AbstractBlock(AbstractSurface):
 
     center: eqx.AbstractVar[Any]
     half_size: eqx.AbstractVar[Any]
+    has_edges: ClassVar[bool] = True
+    faces: eqx.AbstractClassVar[tuple[int, ...]]  # the axes across which there are faces
 
     @abstractmethod
     def _frame(self) -> tuple[Any, Any, tuple]:
@@ -142,19 +142,45 @@ class AbstractBlock(AbstractSurface):
     def extent(self):
         return plus(norm(components(self.center)), norm(components(self.half_size)))
 
+    def returns(self, x, v, half_a, t):
+        y, axes, half = self.in_frame(x)
+        w, b = along(v, axes), along(half_a, axes)
+        pick = _farthest(y, half, self.faces)
+        backwards = pick(y) < 0
+        rise, pull = (where(backwards, times(-1.0, c), c) for c in (pick(w), times(-1.0, pick(b))))
+        comes = (pull > 0) & (rise > 0) & _is_over(y, half, pick)
+        duration = where(comes, rise / where(comes, pull, 1.0), 0.0)
+        landing = tuple(plus(c, times(duration, plus(u, times(duration, d)))) for c, u, d in zip(y, w, b, strict=True))
+        return Return(duration, comes & _is_over(landing, half, pick), rise, pull)  # pyright: ignore
+
+
+def _farthest(y: Vector3, half: Vector3, choices: Sequence[int]) -> Callable[[Sequence], Any]:
+    """Picks from three things that of the axis along which a point is farthest beyond a box, among `choices`."""
+    if len(choices) == 1:
+        return lambda options: options[choices[0]]
+    excess = _excess(y, half)
+    first = (excess[0] >= excess[1]) & (excess[0] >= excess[2])
+    second = excess[1] >= excess[2]
+    return lambda options: where(first, options[0], where(second, options[1], options[2]))
+
 
 def _face(x: Vector3, center: Vector3, half: Vector3, axes: tuple, choices: Sequence[int]) -> Face:
     """The face that a point is farthest beyond, of those across the axes `choices`."""
     y = _in_frame(x, center, axes)
-    beyond = _excess(y, half)
-    best = jnp.argmax(jnp.stack([jnp.asarray(beyond[k]) for k in choices]))
-    side = select(best, [where_number(y[k] < 0, -1.0, 1.0) for k in choices])
-    normal = scale(side, select_vector(best, [axes[k] for k in choices]))
-    first, second = ([(k + i) % 3 for k in choices] for i in (1, 2))
-    tangents = tuple(select_vector(best, [axes[k] for k in each]) for each in (first, second))
-    sizes = tuple(select(best, [half[k] for k in each]) for each in (first, second))
-    below = select(best, [jnp.where(beyond[i] + beyond[j] > 0, 0.0, 1.0) for i, j in zip(first, second, strict=True)])
-    return Face(normal, center, tangents, sizes, below > 0.5)  # pyright: ignore
+    pick = _farthest(y, half, choices)
+    pick_vector = lambda vectors: tuple(pick(column) for column in zip(*vectors, strict=True))  # noqa: E731
+    turned = [[*things[i:], *things[:i]] for things in (axes, half) for i in (1, 2)]  # the next axis, and the one after
+    backwards = pick(y) < 0
+    normal = tuple(where(backwards, times(-1.0, c), c) for c in pick_vector(axes))
+    tangents, sizes = (pick_vector(turned[0]), pick_vector(turned[1])), (pick(turned[2]), pick(turned[3]))
+    return Face(normal, center, tangents, sizes, _is_over(y, half, pick))  # pyright: ignore
+
+
+def _is_over(y: Vector3, half: Vector3, pick: Callable) -> Any:
+    """Whether a point is over the face across the axis that `pick` picks."""
+    within = [abs(c) <= h for c, h in zip(y, half, strict=True)]
+    others = [within[i - 2] & within[i - 1] for i in range(3)]
+    return pick(others)
 
 
 class Box(AbstractBlock):
@@ -174,6 +200,7 @@ class Box(AbstractBlock):
     half_size: Any = eqx.field(converter=as_vector)
     law: AbstractContactLaw
     rotation: Any = eqx.field(converter=as_quaternion, default=None)
+    faces: ClassVar[tuple[int, ...]] = (0, 1, 2)
 
     def __check_init__(self):
         check(self)
@@ -187,7 +214,7 @@ class Box(AbstractBlock):
 
     def face(self, x, t):
         center, half, axes = self._frame()
-        return _face(x, center, half, axes, (0, 1, 2))
+        return _face(x, center, half, axes, self.faces)
 
     def is_proper(self, radius):
         return [positive("half_size", h) for h in components(self.half_size)]
@@ -211,6 +238,7 @@ class Rectangle(AbstractBlock):
     tangent: Any = eqx.field(converter=as_vector)
     half_size: Any = eqx.field(converter=as_pair)
     law: AbstractContactLaw
+    faces: ClassVar[tuple[int, ...]] = (2,)
 
     def __init__(self, center: Any, normal: Any, tangent: Any, half_size: Any, law: AbstractContactLaw):
         self.center, self.facing, self.tangent = as_vector(center), as_vector(normal), as_vector(tangent)
@@ -230,7 +258,7 @@ class Rectangle(AbstractBlock):
 
     def face(self, x, t):
         center, half, axes = self._frame()
-        return _face(x, center, half, axes, (2,))
+        return _face(x, center, half, axes, self.faces)
 
     def is_proper(self, radius):
         n, raw = components(self.facing), components(self.tangent)

@@ -2,13 +2,12 @@
 and leaves faces over their edges. Rolling is a phase of the same motion, on the same loop and in the same log."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
-import jax.core
 import jax.numpy as jnp
 from jax import lax
 
@@ -16,6 +15,7 @@ from .._impact import rolling, train
 from .._math import (
     KINDS,
     RESULTS,
+    Choice,
     Number,
     Vector3,
     add,
@@ -27,25 +27,26 @@ from .._math import (
     ratio,
     rolled,
     scale,
-    select,
-    select_vector,
     subtract,
     times,
-    where_number,
+    where,
+    where_vector,
 )
 from .floors import Floors
 from .hops import Hopper
 from .round import round_bend, round_level
 from .scene import Flight, Scene
 from .surface import Face
-from .system import AbstractSystem, bounces, rounding
+from .system import AbstractSystem, Meeting, bounces, magnitude, rounding
 
 
 class Ground(NamedTuple):
-    """What a ball on a face has below it."""
+    """What a ball that stays on a face has below it."""
 
     face: Face
-    edged: Any  # whether the face has edges
+    edged: Any  # whether it is on a face with edges
+    rolls: Any  # whether it is on a face on which it rolls, perhaps after sliding
+    friction: Number | None  # of that face; infinite where it never slides or never rolls
     slip: Vector3  # zero of a ball that rolls, and where there is no friction to slide against
     heading: Vector3  # the direction in which it slides against friction, or zero
     straight: Any  # whether it keeps that direction until its slip ends
@@ -59,8 +60,28 @@ class Travel(NamedTuple):
     below: Ground | None = None  # only while an arc is worked on
 
 
-def _where(condition: Any, a: Sequence[Number], b: Sequence[Number]) -> Any:
-    return tuple(where_number(condition, x, y) for x, y in zip(a, b, strict=True))
+class Touch(NamedTuple):
+    """A ball that crosses a contact, and what is below it: the face that it is on, or else that of the surface that it
+    hits."""
+
+    contact: Choice
+    time: Any
+    state: Travel
+    normal: Vector3  # of what is hit
+    struck: Flight  # the ball after an ordinary impact
+    pull: Vector3  # gravity, and what air gives then
+    floor: Choice
+    face: Face
+    edged: Any
+    first: train.Start  # of the train that begins
+    law: train.Contact
+    slips: Any  # whether all impacts of the train slip
+    grips: Any  # whether all of them grip
+
+    @property
+    def on(self) -> Any:
+        """Whether the ball was on a face before."""
+        return self.state.support >= 0
 
 
 def _if_any(condition: Any, wanted: Callable, plain: Callable) -> Any:
@@ -91,10 +112,14 @@ class Grounded(AbstractSystem):
         return Floors(self.scene)
 
     @property
+    def _n_surfaces(self) -> int:
+        return len(self.scene.surfaces)
+
+    @property
     def _end_of_slip(self) -> int:
         """The contact at which a slip has died out, behind the surfaces and, where some of them have faces with edges,
         the two pairs of edges of the face below."""
-        return len(self.scene.surfaces) + 2 * self._floors.have_edges
+        return self._n_surfaces + 2 * self._floors.have_edges
 
     @property
     def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -115,61 +140,63 @@ class Grounded(AbstractSystem):
         return state._replace(below=self._ground(time, state))
 
     def _ground(self, time: Any, state: Travel) -> Ground:
-        flight = state.flight
-        face, edged = self._floors.face(state.support, flight.position, time)
-        if not self._floors.have_friction:
-            return Ground(face, edged, rolling.NONE, rolling.NONE, True)
-        ball, n, friction = self.scene.ball, face.normal, self._floors.friction(state.support)
-        slides = (state.support >= 0) & self._floors.rolls(state.support) & jnp.isfinite(friction)
-        slip = _where(slides, rolling.own_slip(ball.radius, n, flight.velocity, flight.spin), rolling.NONE)
+        flight, floors, on = state.flight, self._floors, state.support >= 0
+        support = Choice(self.phase(state), self._n_surfaces)
+        face, edged = floors.face(support, flight.position, time)
+        edged, rolls = on & edged, on & floors.rolls(support)
+        if not floors.have_friction:
+            return Ground(face, edged, rolls, None, rolling.NONE, rolling.NONE, True)
+        ball, n, friction = self.scene.ball, face.normal, floors.friction(support)
+        slides = rolls & jnp.isfinite(friction)
+        slip = rolling.own_slip(ball.radius, n, flight.velocity, flight.spin)
+        slip = where_vector(slides, slip, rolling.NONE)
         a = self._pull(time, flight)
-        most = jnp.where(slides, friction, 0.0) * -dot(a, n) * (1.0 + 1.0 / ball.inertia_ratio)
+        most = where(slides, friction, 0.0) * -dot(a, n) * (1.0 + 1.0 / ball.inertia_ratio)
         along = rolling.along_surface(n, a)
-        heading = _where(slides, rolling.heading(slip, along, most), rolling.NONE)
+        heading = where_vector(slides, rolling.heading(slip, along, most), rolling.NONE)
         straight = self.parabolic or rolling.stays_straight(heading, slip, along, most, self.tolerance)
-        return Ground(face, edged, slip, heading, straight)
+        return Ground(face, edged, rolls, friction, slip, heading, straight)
 
     def derivative(self, time, state, q, v):
-        flight, on = state.flight, state.support >= 0
-        below, ball = self._below(time, state), self.scene.ball
-        n, rolls = below.face.normal, on & self._floors.rolls(state.support)
-        q, slip = q[:3], q[3:]
+        flight, on, ball = state.flight, state.support >= 0, self.scene.ball
+        below = self._below(time, state)
+        n, (q, slip) = below.face.normal, (q[:3], q[3:])
         if self.scene.air is not None:
             turning = subtract(v, slip) if slip else v
             spin = rolling.rolling_spin(ball.radius, n, turning, flight.spin)
-            flight = flight._replace(spin=_where(rolls, spin, flight.spin))
+            flight = flight._replace(spin=where_vector(below.rolls, spin, flight.spin))
         _, a = self.scene.derivative(time, flight, q, v)
         along, alpha = rolling.along_surface(n, a), ball.inertia_ratio
-        changes = self._slip_rate(state, below, slip, along, dot(a, n)) if slip else ()
+        changes = self._slip_rate(below, slip, along, dot(a, n)) if slip else ()
         # Friction leaves v + alpha r (omega x n) alone, so that (1 + alpha) v - alpha u changes by gravity only.
         rolling_rate = add(along, scale(alpha, changes)) if slip else along
-        rate = _where(rolls, scale(1.0 / (1.0 + alpha), rolling_rate), along)
-        return (*v, *changes), _where(on, rate, a)
+        rate = where_vector(below.rolls, scale(1.0 / (1.0 + alpha), rolling_rate), along)
+        return (*v, *changes), where_vector(on, rate, a)
 
-    def _slip_rate(self, state: Travel, below: Ground, slip: Vector3, along: Vector3, push: Number) -> Vector3:
+    def _slip_rate(self, below: Ground, slip: Vector3, along: Vector3, push: Number) -> Vector3:
         """The rate of the slip, zero for a ball that does not slide against friction."""
         slides, heading = dot(below.heading, below.heading) > 0, below.heading
-        most = jnp.where(slides, self._floors.friction(state.support), 0.0) * -push
+        assert below.friction is not None
+        most = where(slides, below.friction, 0.0) * -push
         most = most * (1.0 + 1.0 / self.scene.ball.inertia_ratio)
         rate = scale(dot(along, heading) - most, heading)
         if not self.parabolic:
             turning = subtract(along, scale(most, rolling.later_heading(slip, heading)))
-            rate = _where(below.straight, rate, turning)
-        return _where(slides, rate, rolling.NONE)
+            rate = where_vector(below.straight, rate, turning)
+        return where_vector(slides, rate, rolling.NONE)
 
     def advanced(self, time, state, q, v, duration):
-        rolls = (state.support >= 0) & self._floors.rolls(state.support)
         flight = self.scene.advanced(time, state.flight, q[:3], v, duration)
-        below, ball = self._below(time, state), self.scene.ball
+        below, radius = self._below(time, state), self.scene.ball.radius
         slips = (below.slip, q[3:] if self._floors.have_friction else rolling.NONE)
-        before, after = (rolling.rolling_spin(ball.radius, below.face.normal, subtract(u, slip), flight.spin)
-                         for u, slip in zip((state.flight.velocity, v), slips, strict=True))  # fmt: skip
+        turning = [subtract(u, slip) for u, slip in zip((state.flight.velocity, v), slips, strict=True)]
+        after = rolling.rolling_spin(radius, below.face.normal, turning[1], flight.spin)
         orientation = flight.orientation
         if orientation is not None:
-            orientation = jnp.where(
-                rolls, rolled(state.flight.orientation, before, after, duration, orientation.dtype), orientation
-            )
-        spin = _where(rolls, after, flight.spin)
+            before = rolling.rolling_spin(radius, below.face.normal, turning[0], flight.spin)
+            turned = rolled(state.flight.orientation, before, after, duration, orientation.dtype)
+            orientation = jnp.where(below.rolls, turned, orientation)
+        spin = where_vector(below.rolls, after, flight.spin)
         return Travel(flight._replace(spin=spin, orientation=orientation), state.support)
 
     # Contacts
@@ -178,40 +205,43 @@ class Grounded(AbstractSystem):
         return jnp.asarray(state.support).astype(jnp.int32)
 
     def named(self, contact, state):
-        return jnp.where(contact >= len(self.scene.surfaces), self.phase(state), contact)
+        return where(contact.index >= self._n_surfaces, self.phase(state), contact.index)
 
     def _below(self, time: Any, state: Travel) -> Ground:
         return self._ground(time, state) if state.below is None else state.below
 
     def _exit(self, contact: int, state: Travel, time: Any) -> tuple[Vector3, Vector3, Number, Any]:
         """Along one pair of edges: across, middle, half size, and whether there are such edges."""
-        face, edged, *_ = self._below(time, state)
-        assert face.half is not None
-        k = contact - len(self.scene.surfaces)
-        return face.tangents[k], face.center, face.half[k], (state.support >= 0) & (edged > 0)
+        below = self._below(time, state)
+        assert below.face.half is not None
+        k = contact - self._n_surfaces
+        return below.face.tangents[k], below.face.center, below.face.half[k], below.edged
 
     def level(self, contact, time, q, state):
         x = q[:3]
-        if contact < len(self.scene.surfaces):
-            return jnp.where(state.support == contact, 1.0, self.scene.level(contact, time, x, state.flight))
+        if contact < self._n_surfaces:
+            return where(state.support == contact, 1.0, self.scene.level(contact, time, x, state.flight))
         if contact == self._end_of_slip:
             heading = self._below(time, state).heading
-            return jnp.where(dot(heading, heading) > 0, dot(heading, q[3:]), 1.0)
+            return where(dot(heading, heading) > 0, dot(heading, q[3:]), 1.0)
         across, middle, half, present = self._exit(contact, state, time)
         y = dot(across, subtract(x, middle))
-        return jnp.where(present, round_level((y,), half, True), 1.0)
+        return where(present, round_level((y,), half, True), 1.0)
 
-    def face(self, contact, time, q):
-        return self.scene.face(contact, time, q[:3]) if contact < len(self.scene.surfaces) else None
+    def is_parabolic(self, contact):
+        return contact == self._end_of_slip or (contact < self._n_surfaces and self.scene.is_parabolic(contact))
+
+    def returns(self, contact, time, q, v, half_a):
+        if contact >= self._n_surfaces:
+            return None
+        return self.scene.returns(contact, time, q[:3], v[:3], half_a[:3])
 
     def reach(self, contact, q):
-        if contact == self._end_of_slip:
-            return None
-        return self.scene.reach(contact, q[:3]) if contact < len(self.scene.surfaces) else self.scene.ball.radius
+        return self.scene.reach(contact, q[:3]) if contact < self._n_surfaces else self.scene.ball.radius
 
     def bend(self, contact, time, window, state):
         place = window._replace(coefficients=window.coefficients[:3])
-        if contact < len(self.scene.surfaces):
+        if contact < self._n_surfaces:
             bend, skip = self.scene.bend(contact, time, place, state.flight), state.support == contact
         elif contact == self._end_of_slip:
             heading = self._below(time, state).heading
@@ -220,234 +250,239 @@ class Grounded(AbstractSystem):
         else:
             across, middle, half, present = self._exit(contact, state, time)
             bend, skip = round_bend(place, (across,), middle, half, True), ~present
-        low, high = (jnp.where(skip, 0.0, x) for x in bend)
+        low, high = (where(skip, 0.0, x) for x in bend)
         return type(bend)(low, high)
 
     def is_bounded(self, contact):
-        return contact >= len(self.scene.surfaces) or self.scene.is_bounded(contact)
+        return contact >= self._n_surfaces or self.scene.is_bounded(contact)
 
     def extent(self, contact):
-        return self.scene.extent(contact) if contact < len(self.scene.surfaces) else self.scene.ball.radius
+        return self.scene.extent(contact) if contact < self._n_surfaces else self.scene.ball.radius
 
     # What happens there
-
-    def _floor(self, contact: Any, time: Any, state: Travel) -> tuple[Face, Any]:
-        """The face that the ball is on, or else that of the surface that it hits; and whether it has edges."""
-        return self._floors.face(jnp.where(state.support >= 0, self.phase(state), contact), state.flight.position, time)
-
-    def _start(self, time: Any, struck: Flight, face: Face) -> train.Start:
-        """What a train begins with, after the first impact."""
-        return train.start(struck.velocity, struck.spin, face.normal, self._pull(time, struck), self.scene.ball.radius)
 
     def _pull(self, time: Any, flight: Flight) -> Vector3:
         """Gravity, and what air gives now."""
         _, a = self.scene.derivative(time, flight, flight.position, flight.velocity)
         return a
 
-    def _regime(self, contact: Any, first: train.Start) -> tuple[Any, Any]:
+    def _touch(self, contact: Choice, time: Any, state: Travel, n: Vector3, struck: Flight, pull: Vector3) -> Touch:
+        floors = self._floors
+        floor = Choice(where(state.support >= 0, self.phase(state), contact.index), self._n_surfaces)
+        face, edged = floors.face(floor, state.flight.position, time)
+        first = train.start(struck.velocity, struck.spin, face.normal, pull, self.scene.ball.radius)
+        law = floors.law(floor)
+        slips, grips = self._regime(first, law)
+        return Touch(contact, time, state, n, struck, pull, floor, face, edged, first, law, slips, grips)
+
+    def _regime(self, first: train.Start, law: train.Contact) -> tuple[Any, Any]:
         """Whether all impacts of a train slip, and whether all of them grip."""
-        law = self._floors.law(contact)
         if law.friction is None:
-            return jnp.asarray(False), jnp.asarray(True)
+            return False, True
         limited = law.rolls & jnp.isfinite(law.friction)
         tolerance = jnp.inf if self.parabolic else self.tolerance  # a path that bends has a name of its own
         slips = limited & train.slips_throughout(first, law, tolerance)
         return slips, ~limited | (train.grips_throughout(first, law) & ~slips)
 
-    def _summed(self, contact: Any, first: train.Start) -> train.End:
-        slips, _ = self._regime(contact, first)
-        return train.summed(first, self._floors.law(contact), slips)
-
-    def _room(self, contact: Any, x: Vector3, time: Any, face: Face, edged: Any) -> Number:
+    def _room(self, touch: Touch) -> Number:
         """How far the centre can go from a place on a surface without meeting another, or the face's edge."""
-        radius = self.scene.ball.radius
-        assert face.half is not None
+        radius, x, face = self.scene.ball.radius, touch.struck.position, touch.face
         room: Number = jnp.inf
-        for across, half in zip(face.tangents, face.half, strict=True):
-            margin = half - abs(dot(across, subtract(x, face.center)))
-            room = minimum(room, jnp.where(edged > 0, margin, jnp.inf))
+        if self._floors.have_edges:
+            assert face.half is not None
+            for across, half in zip(face.tangents, face.half, strict=True):
+                margin = half - abs(dot(across, subtract(x, face.center)))
+                room = minimum(room, where(touch.edged, margin, jnp.inf))
         for i, surface in enumerate(self.scene.surfaces):
-            room = minimum(room, jnp.where(contact == i, jnp.inf, surface.clearance(x, time, radius)))
+            room = minimum(room, where(touch.floor.is_(i), jnp.inf, surface.clearance(x, touch.time, radius)))
         return room
 
-    def _sums(self, contact: Any, time: Any, struck: Flight, first: train.Start, floor: tuple) -> tuple[Any, Any, Any]:
+    def _sums(self, touch: Touch, end: train.End) -> tuple[Any, Any, Any]:
         """How long the train lasts, whether it is clear of other surfaces and of edges until it ends, and whether it
         has a sum: air changes nothing, and all impacts are of one kind."""
-        lasts = train.duration(first, self._floors.law(contact).restitution)
-        lasts_known = jnp.where(jnp.isfinite(lasts), lasts, 0.0)
+        first, struck = touch.first, touch.struck
+        lasts = train.duration(first, touch.law.restitution)
+        lasts_known = where(jnp.isfinite(lasts), lasts, 0.0)
         height = ratio(first.rise * first.rise, 2.0 * first.pull)
-        clear = train.span(first, lasts_known) + height < self._room(contact, struck.position, time, *floor)
-        calm = jnp.asarray(True)
+        clear = train.span(first, lasts_known) + height < self._room(touch)
+        calm: Any = True
         if self.scene.air is not None:  # its force now is part of the sum; what matters is how that changes
-            end = self._summed(contact, first)
-            later = self._pull(time, struck._replace(velocity=end.velocity, spin=end.spin))
-            calm = norm(subtract(self._pull(time, struck), later)) * lasts_known <= self.tolerance
+            later = self._pull(touch.time, struck._replace(velocity=end.velocity, spin=end.spin))
+            calm = norm(subtract(touch.pull, later)) * lasts_known <= self.tolerance
         if struck.orientation is not None:  # infinitely many rotations have no sum
-            calm = jnp.asarray(False)
-        slips, grips = self._regime(contact, first)
-        return lasts, clear, calm & (slips | grips)
+            calm = False
+        return lasts, clear, calm & (touch.slips | touch.grips)
 
-    def _stays(self, contact: Any, support: Any) -> Any:
-        """Whether a ball on `support` stays on it when it hits a surface: Theorem 5.1 needs one common mu there, and a
-        smooth wall turns the ball round."""
-        rolls = self._floors.holds(support)
-        stays = []
+    def _stays(self, touch: Touch) -> Any:
+        """Whether a ball on its support stays on it when it hits a surface: Theorem 5.1 needs one common mu there, and
+        a smooth wall turns the ball round."""
+        rolls, stays = touch.on & self._floors.holds(touch.floor), []
         for surface in self.scene.surfaces:
             law = surface.law
-            common = law.rolls and law.sliding_friction() is None and law.reversal() == law.restitution
-            stays.append(jnp.where(rolls & jnp.asarray(common), 1.0, 0.0) if law.rolls else float(law.rolls is False))
-        return jnp.asarray(select(contact, stays)) > 0.5
+            common = bool(law.rolls) and law.sliding_friction() is None and law.reversal() == law.restitution
+            stays.append(rolls & common if law.rolls else law.rolls is False)
+        return touch.contact.of(stays)
 
     def bounced(self, contact, time, state):
         return Travel(self.scene.bounced(contact, time, state.flight), state.support)
 
-    def follows(self, contact, time, state, bounced, left, rests, ends):
-        face, _ = self._floor(contact, time, state)
-        first = self._start(time, bounced.flight, face)
-        is_floor = self._floors.include(contact) & face.below & (first.pull > 0)
-        soon = is_floor & ((train.duration(first, self._floors.law(contact).restitution) <= left) | rests)
-        arguments = (contact, time, state, bounced, left, rests, ends)
-        return _if_any((state.support >= 0) | soon, lambda: self._settling(*arguments), lambda: bounces(ends))
+    def meets(self, contact, time, state, left, rests, ends):
+        n, struck = self.scene.struck(contact, time, state.flight)
+        pull = self._pull(time, struck)
+        rise, into, e_n = dot(n, struck.velocity), times(-1.0, dot(n, pull)), self.scene.restitution(contact)
+        # Not later than `train.duration`, or nearly.
+        soon = rests | (times(2.0, rise) <= 1.001 * left * times(into, 1.0 - e_n))
+        soon = self._floors.include(contact) & (into > 0) & soon
 
-    def _settling(self, contact, time, state, bounced, left, rests, ends):
-        on, struck = state.support >= 0, bounced.flight
-        is_exit, grips = contact >= len(self.scene.surfaces), jnp.asarray(contact == self._end_of_slip)
-        floor = self._floor(contact, time, state)
-        first, law = self._start(time, struck, floor[0]), self._floors.law(contact)
-        is_floor = self._floors.include(contact) & floor[0].below & (first.pull > 0)
-        lasts, clear, sums = self._sums(contact, time, struck, first, floor)
+        def plain() -> Meeting:
+            return _as_arrays(bounces(ends, Travel(struck, -1.0)), time)
+
+        def settling() -> Meeting:
+            touch = self._touch(contact, time, state, n, struck, pull)
+            return _as_arrays(self._settling(touch, left, rests, ends), time)
+
+        return _if_any((state.support >= 0) | soon, settling, plain)
+
+    def after(self, contact, time, state, kind):
+        n, struck = self.scene.struck(contact, time, state.flight)
+
+        def settled() -> tuple:
+            touch = self._touch(contact, time, state, n, struck, self._pull(time, struck))
+            return _as_arrays(self._settled(touch, kind, train.summed(*self._train_of(touch, kind)))[:2], time)
+
+        plain = lambda: _as_arrays((Travel(struck, -1.0), 0.0), time)  # noqa: E731
+        return _if_any((state.support >= 0) | (kind != KINDS.bounce), settled, plain)
+
+    def _train_of(self, touch: Touch, kind: KINDS) -> tuple:
+        """What a train is summed from, in an impact of a known kind: one that lies down does not bounce."""
+        first = touch.first
+        return first._replace(rise=where(kind == KINDS.train, first.rise, 0.0)), touch.law, touch.slips
+
+    def _settling(self, touch: Touch, left: Any, rests: Any, ends: Any) -> Meeting:
+        contact, on, first, law = touch.contact, touch.on, touch.first, touch.law
+        is_exit, grips = contact.index >= self._n_surfaces, contact.index == self._end_of_slip
+        is_floor = self._floors.include(contact) & touch.face.below & (first.pull > 0)
+        lasts, clear, sums = self._sums(touch, train.summed(first, law, touch.slips))
         capped = law.rolls & jnp.isfinite(jnp.inf if law.friction is None else law.friction)
         small = rests & ~capped  # whatever it is, it is taken for a train
         dies_out = is_floor & (lasts <= left) & (small | (clear & sums))
         moves = dot(first.slip, first.slip) + dot(first.along, first.along) > 0
         endless = dies_out & law.rolls & ~capped & (abs(law.reversal) == 1) & (law.restitution < 1) & moves
-        lies = is_floor & jnp.where(capped, ends, rests)
+        lies = is_floor & where(capped, ends, rests)
 
         # Beside a wall a ball lies down where it is: what it goes during its last bounces could take it through.
         bounce_or_end = KINDS.where(dies_out & clear, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
-        wall = KINDS.where(self._stays(contact, state.support), KINDS.rolling, KINDS.bounce)
+        wall = KINDS.where(self._stays(touch), KINDS.rolling, KINDS.bounce)
         over = KINDS.where(grips, KINDS.gripped, KINDS.left)
         kind = KINDS.where(on, KINDS.where(is_exit, over, wall), bounce_or_end)
 
-        stuck = ~is_exit & jnp.where(on, rests & ~self._is_wedged(contact, time, state), ends & ~is_floor)
+        end = train.summed(*self._train_of(touch, kind))
+        after, pause, wedged, is_at_rest = self._settled(touch, kind, end)
+        stuck = ~is_exit & where(on, rests & ~wedged, ends & ~is_floor)
         fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
         fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
-        fault = RESULTS.where(on & is_exit & ~grips & self._tips(contact, state, floor[0]), RESULTS.pivoting, fault)
+        fault = RESULTS.where(on & is_exit & ~grips & self._tips(touch), RESULTS.pivoting, fault)
         if self._floors.have_friction and self.parabolic:
-            after, _ = self.impact(contact, time, state, bounced, kind)
-            below, pull = self._ground(time, after), self._pull(time, after.flight)
+            below, pull = self._ground(touch.time, after), self._pull(touch.time, after.flight)
             straight = rolling.is_straight(below.heading, rolling.along_surface(below.face.normal, pull), norm(pull))
             bends = (after.support >= 0) & ~straight
             fault = RESULTS.where(bends, RESULTS.curved_slide, fault)
-        return kind, fault
+        return Meeting(kind, fault, after, pause, is_at_rest)
 
-    def _tips(self, contact: Any, state: Travel, face: Face) -> Any:
+    def _tips(self, touch: Touch) -> Any:
         """Whether a ball that comes to an edge is too slow to fly off: v^2 < g_n r, v across the edge."""
-        second = contact > len(self.scene.surfaces)
-        across = _where(second, face.tangents[1], face.tangents[0])
-        speed = dot(across, state.flight.velocity)
-        pull = times(-1.0, dot(face.normal, components(self.scene.gravity)))
+        second = touch.contact.index > self._n_surfaces
+        across = where_vector(second, touch.face.tangents[1], touch.face.tangents[0])
+        speed = dot(across, touch.state.flight.velocity)
+        pull = times(-1.0, dot(touch.face.normal, components(self.scene.gravity)))
         return speed * speed < pull * self.scene.ball.radius * (1.0 + 1e-5)
 
-    def impact(self, contact, time, state, bounced, kind):
-        as_arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=time.dtype), tree)  # noqa: E731
-        return _if_any(
-            (state.support >= 0) | (kind != KINDS.bounce),
-            lambda: as_arrays(self._settled(contact, time, state, bounced, kind)),
-            lambda: as_arrays((Travel(bounced.flight, -1.0), 0.0)),
+    def _settled(self, touch: Touch, kind: KINDS, end: train.End) -> tuple[Travel, Any, Any, Any]:
+        """The state after an impact of that kind, how many seconds have passed, whether all that is left of the motion
+        is impacts in a groove, and whether nothing moves any more."""
+        flight, on, struck, n = touch.state.flight, touch.on, touch.struck, touch.face.normal
+        is_train, rolls, left, grips = (
+            kind == each for each in (KINDS.train, KINDS.rolling, KINDS.left, KINDS.gripped)
         )
-
-    def _settled(self, contact, time, state, bounced, kind):
-        flight, on, struck = state.flight, state.support >= 0, bounced.flight
-        face, _ = self._floor(contact, time, state)
-        first = self._start(time, struck, face)
-        is_train, rolls, left, grips = (kind == k for k in (KINDS.train, KINDS.rolling, KINDS.left, KINDS.gripped))
         settles, stays = ~on & (is_train | rolls), on & (rolls | grips)
-        first = first._replace(rise=jnp.where(is_train, first.rise, 0.0))
-        end = self._summed(contact, first)
-        kept = self._against(contact, time, flight, state.support, face.normal)
+        kept = self._against(touch)
         if self._floors.have_friction:
             ball = self.scene.ball
-            velocity, spin = rolling.gripped(ball.radius, ball.inertia_ratio, face.normal, flight.velocity, flight.spin)
-            kept = kept._replace(velocity=_where(grips, velocity, kept.velocity), spin=_where(grips, spin, kept.spin))
+            velocity, spin = rolling.gripped(ball.radius, ball.inertia_ratio, n, flight.velocity, flight.spin)
+            kept = where_vector(grips, velocity, kept[0]), where_vector(grips, spin, kept[1])
+        held, pull = self._held(touch)
+        wedged = self._is_wedged(touch, held, pull)
+        kept = [where_vector(wedged, rolling.NONE, x) for x in kept]
 
-        wedged = self._is_wedged(contact, time, state)
-        kept = kept._replace(velocity=_where(wedged, rolling.NONE, kept.velocity),
-                             spin=_where(wedged, rolling.NONE, kept.spin))  # fmt: skip
-
-        velocity = _where(left, flight.velocity, _where(stays, kept.velocity, struck.velocity))
-        spin = _where(left, flight.spin, _where(stays, kept.spin, struck.spin))
+        velocity = where_vector(left, flight.velocity, where_vector(stays, kept[0], struck.velocity))
+        spin = where_vector(left, flight.spin, where_vector(stays, kept[1], struck.spin))
         after = flight._replace(
-            position=_where(settles, add(flight.position, end.shift), flight.position),
-            velocity=_where(settles, end.velocity, velocity),
-            spin=_where(settles & self._floors.rolls(contact), end.spin, spin),
+            position=where_vector(settles, add(flight.position, end.shift), flight.position),
+            velocity=where_vector(settles, end.velocity, velocity),
+            spin=where_vector(settles & touch.law.rolls, end.spin, spin),
         )
-        surface = jnp.asarray(contact).astype(jnp.asarray(state.support).dtype)
-        support = jnp.where(settles, surface, jnp.where(stays, state.support, -1.0))
-        return Travel(after, support), jnp.where(settles, end.time, 0.0)
+        surface = touch.contact.index.astype(jnp.asarray(touch.state.support).dtype)
+        support = where(settles, surface, where(stays, touch.state.support, -1.0))
+        at_rest = (settles | stays) & self._is_still(touch, after, held)
+        return Travel(after, support), where(settles, end.time, 0.0), wedged, at_rest
 
-    def _against(self, contact: Any, time: Any, flight: Flight, support: Any, n: Vector3) -> Flight:
-        """A ball that stays on its support hits another surface; where there is friction it may slip afterwards."""
-        ball, surfaces, velocity, spin = self.scene.ball, self.scene.surfaces, flight.velocity, flight.spin
-        wall = self._normal(contact, time, flight.position)
-        mu = select(contact, [surface.law.restitution for surface in surfaces])
-        smooth = jnp.asarray(select(contact, [float(surface.law.rolls is False) for surface in surfaces])) > 0.5
-        turned = rolling.against_smooth(n, wall, mu, velocity)
-        firm = self._floors.holds(support)
-        carried = _where(firm, rolling.rolling_spin(ball.radius, n, turned, spin), spin)
-        velocity, spin = rolling.against_rough(ball.radius, ball.inertia_ratio, n, wall, mu, velocity, spin)
-        return flight._replace(velocity=_where(smooth, turned, velocity), spin=_where(smooth, carried, spin))
+    def _is_still(self, touch: Touch, after: Flight, held: Any) -> Any:
+        """Whether nothing moves any more, nor will."""
+        eps = float(jnp.finfo(touch.time.dtype).eps)
+        size: Callable = lambda flight: norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)  # noqa: E731
+        along = rolling.along_surface(touch.face.normal, components(self.scene.gravity))
+        is_level = (norm(along) <= 64.0 * eps * norm(components(self.scene.gravity))) & (self.scene.air is None)
+        return (size(after) <= 64.0 * eps * size(touch.state.flight)) & (is_level | held)
 
-    def _normal(self, contact: Any, time: Any, x: Vector3) -> Vector3:
-        """The normal at a place of the surface of that index."""
-        return select_vector(contact, [surface.direction(x, time) for surface in self.scene.surfaces])
+    def _against(self, touch: Touch) -> tuple[Vector3, Vector3]:
+        """Velocity and spin of a ball that stays on its support when it hits another surface; where there is friction
+        it may slip afterwards."""
+        ball, flight, n, wall = self.scene.ball, touch.state.flight, touch.face.normal, touch.normal
+        mu = self.scene.restitution(touch.contact)
+        velocity, spin = rolling.against_rough(
+            ball.radius, ball.inertia_ratio, n, wall, mu, flight.velocity, flight.spin
+        )
+        laws = [surface.law for surface in self.scene.surfaces]
+        if all(law.rolls is not False for law in laws):
+            return velocity, spin
+        smooth = touch.contact.of([law.rolls is False for law in laws])
+        turned = rolling.against_smooth(n, wall, mu, flight.velocity)
+        firm = touch.on & self._floors.holds(touch.floor)
+        carried = where_vector(firm, rolling.rolling_spin(ball.radius, n, turned, flight.spin), flight.spin)
+        return where_vector(smooth, turned, velocity), where_vector(smooth, carried, spin)
 
-    def _held(self, contact: Any, time: Any, state: Travel) -> tuple[Number, Any]:
-        """The acceleration with which gravity holds a ball on its support against another surface, and whether it does
-        so: into that surface, and not along the groove between the two."""
-        x, surfaces = state.flight.position, self.scene.surfaces
-        face, _ = self._floors.face(state.support, x, time)
-        wall = self._normal(contact, time, x)
-        g, groove = components(self.scene.gravity), cross(face.normal, wall)
-        pull = times(-1.0, dot(wall, rolling.along_surface(face.normal, g)))
-        eps = float(jnp.finfo(jnp.result_type(*x)).eps)
+    def _held(self, touch: Touch) -> tuple[Any, Number]:
+        """Whether gravity holds a ball on its support against another surface, into that surface and not along the
+        groove between the two; and the acceleration with which it does so."""
+        g, groove = components(self.scene.gravity), cross(touch.face.normal, touch.normal)
+        pull = times(-1.0, dot(touch.normal, rolling.along_surface(touch.face.normal, g)))
+        eps = float(jnp.finfo(touch.time.dtype).eps)
         held = (pull > 0) & (abs(dot(g, groove)) <= 64.0 * eps * norm(g)) & (self.scene.air is None)
-        return pull, held & (state.support >= 0) & (contact < len(surfaces))
+        return held & touch.on & (touch.contact.index < self._n_surfaces), pull
 
-    def _is_wedged(self, contact: Any, time: Any, state: Travel) -> Any:
+    def _is_wedged(self, touch: Touch, held: Any, pull: Number) -> Any:
         """Whether all that is left of the motion of a ball in a groove is impacts on a surface beside its support, from
         which it moves off by less than rounding."""
-        flight, surfaces = state.flight, self.scene.surfaces
-        pull, held = self._held(contact, time, state)
-        closing = dot(self._normal(contact, time, flight.position), flight.velocity)
-        tolerance = select(contact, [rounding(self, i, flight.position) for i in range(len(surfaces))])
+        flight = touch.state.flight
+        closing, size = dot(touch.normal, flight.velocity), magnitude(flight.position)
+        noises = [rounding(self, i, size, touch.time.dtype) for i in range(self._n_surfaces)]
         creeps = norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin) <= 64.0 * abs(closing)
-        return held & self._stays(contact, state.support) & creeps & (closing * closing <= 4.0 * pull * tolerance)
+        small = closing * closing <= 4.0 * pull * touch.contact.of(noises)
+        return held & self._stays(touch) & creeps & small
 
     def during(self, contact, time, state, elapsed):
         """The state so long after the first impact of a train."""
-        face, _ = self._floors.face(contact, state.flight.position, time)
-        struck = self.scene.bounced(contact, time, state.flight)
-        first = self._start(time, struck, face)
-        law, (slips, _) = self._floors.law(contact), self._regime(contact, first)
-        last = train.bounced(first, law, slips, train.bounces_within(first, law.restitution, elapsed))
+        n, struck = self.scene.struck(contact, time, state.flight)
+        touch = self._touch(contact, time, state._replace(support=-1.0), n, struck, self._pull(time, struck))
+        first, law = touch.first, touch.law
+        last = train.bounced(first, law, touch.slips, train.bounces_within(first, law.restitution, elapsed))
         velocity = add(last.velocity, scale(last.rise, first.normal))
         since = jnp.maximum(elapsed - last.time, 0.0)
-        gravity = self._pull(time, struck)
-        fall = add(scale(since, velocity), scale(0.5 * since * since, gravity))
+        fall = add(scale(since, velocity), scale(0.5 * since * since, touch.pull))
         position = add(add(struck.position, last.shift), fall)
-        spin = _where(law.rolls, last.spin, struck.spin)
-        flight = struck._replace(position=position, velocity=add(velocity, scale(since, gravity)), spin=spin)
-        return Travel(flight, -1.0)
-
-    def is_at_rest(self, contact, time, before, after):
-        eps = float(jnp.finfo(after.flight.position[0].dtype).eps)
-        size: Callable = lambda flight: norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)  # noqa: E731
-        face, _ = self._floor(contact, time, before)
-        g = components(self.scene.gravity)
-        is_level = (norm(rolling.along_surface(face.normal, g)) <= 64.0 * eps * norm(g)) & (self.scene.air is None)
-        still = size(after.flight) <= 64.0 * eps * size(before.flight)
-        return (after.support >= 0) & still & (is_level | self._held(contact, time, before)[1])
+        spin = where_vector(law.rolls, last.spin, struck.spin)
+        velocity = add(velocity, scale(since, touch.pull))
+        return Travel(struck._replace(position=position, velocity=velocity, spin=spin), -1.0)
 
     # Where nothing settles
 
@@ -492,6 +527,12 @@ class Grounded(AbstractSystem):
 
     def without_contacts(self):
         return dataclasses.replace(self, hits=False)
+
+
+def _as_arrays(tree: Any, time: Any) -> Any:
+    """Numbers as arrays of the dtype of the time; codes and flags as arrays."""
+    number = lambda x: x if eqx.is_array(x) and not jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(time.dtype)  # noqa: E731
+    return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, bool) else number(jnp.asarray(x)), tree)
 
 
 def grounded(scene: Scene, tolerance: float, parabolic: bool) -> Scene | Grounded:

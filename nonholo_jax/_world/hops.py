@@ -14,7 +14,19 @@ import equinox.internal as eqxi
 import jax.numpy as jnp
 from jax import lax
 
-from .._math import Number, Vector3, add, is_constant, plus, scale, select, shared, times, total
+from .._math import (
+    Choice,
+    Number,
+    Vector3,
+    add,
+    is_constant,
+    plus,
+    scale,
+    shared,
+    times,
+    total,
+    where,
+)
 
 
 class Hop(NamedTuple):
@@ -51,17 +63,17 @@ class Wall(NamedTuple):
     def time_to(self, left_behind: Any) -> tuple[Any, Any]:
         """When the gap closes: infinite where it does not, negative where rounding could decide; and whether that is
         only a bound from below."""
-        gap = jnp.where(left_behind, 0.0, jnp.maximum(self.gap, 0.0))
-        rate = jnp.where(left_behind, jnp.maximum(self.rate, 0.0), self.rate)
+        gap = where(left_behind, 0.0, jnp.maximum(self.gap, 0.0))
+        rate = where(left_behind, jnp.maximum(self.rate, 0.0), self.rate)
         closes = rate < 0
         if is_constant(self.pull) and self.pull == 0:
-            return jnp.where(closes, gap / jnp.where(closes, -rate, 1.0), jnp.inf), False
+            return where(closes, gap / where(closes, -rate, 1.0), jnp.inf), False
         square = rate * rate - 4.0 * self.pull * gap
         # Not only a root, but an impact that is well above rounding, so that the ball bounces.
         clear = square > 8.0 * abs(self.pull) * self.noise + 64.0 * float(jnp.finfo(rate.dtype).eps) * rate * rate
-        found = jnp.where(clear, _closing(gap, rate, self.pull, jnp.where(clear, square, 1.0)), -1.0)
+        found = where(clear, _closing(gap, rate, self.pull, where(clear, square, 1.0)), -1.0)
         opens = jnp.asarray(self.pull >= 0) & ((square < 0) | ~closes)  # nothing pulls it there
-        return jnp.where(opens, jnp.inf, found), False
+        return where(opens, jnp.inf, found), False
 
     def is_near(self, h: Any) -> Any:
         """Whether the ball touches it, or nearly, after so long."""
@@ -91,8 +103,8 @@ class Block(NamedTuple):
             at = y + h * (w + a * h)
             beyond, speed = jnp.maximum(abs(at) - half, 0.0), w + 2.0 * a * h
             value = value + beyond * beyond / (2.0 * self.radius)
-            slope = slope + beyond * jnp.where(at < 0, -speed, speed) / self.radius
-            square = square + jnp.where(beyond > 0, speed * speed, 0.0)
+            slope = slope + beyond * where(at < 0, -speed, speed) / self.radius
+            square = square + where(beyond > 0, speed * speed, 0.0)
         return value, slope, square
 
     def time_to(self, left_behind: Any) -> tuple[Any, Any]:
@@ -100,7 +112,7 @@ class Block(NamedTuple):
         that is only a bound from below. It enters the greater box first; where it does so over a face, it is there."""
         enters = self._enters(left_behind)
         comes = jnp.isfinite(enters)
-        (h,) = shared([jnp.where(comes, enters, 0.0)])
+        (h,) = shared([where(comes, enters, 0.0)])
         first, on_face = h, self.level(h)[0] <= self.noise
         h, fits = self._to_edge(h, comes & ~on_face)
         _, slope, square = self.level(h)
@@ -113,7 +125,7 @@ class Block(NamedTuple):
         _, leaving, square = self.level(jnp.zeros_like(enters))
         starts = ~inside | (left_behind & (leaving > 0) & self.is_convex(square))
         hits = fits & (slope < 0) & clear
-        return jnp.where(starts, jnp.where(comes, jnp.where(hits, h, first), jnp.inf), -1.0), comes & ~hits
+        return where(starts, where(comes, where(hits, h, first), jnp.inf), -1.0), comes & ~hits
 
     def _to_edge(self, begun: Any, needed: Any) -> tuple[Any, Any]:
         """From the greater box to the rounded one, by Newton's method from one side, for the level is convex where the
@@ -124,7 +136,7 @@ class Block(NamedTuple):
             count, h, fits, far = carry
             value, slope = shared(self.level(h)[:2])
             fits, far = fits & (value >= -self.noise), far & (value > 0.125 * self.noise) & (slope < 0)
-            return count + 1, h + jnp.where(far, value / jnp.where(slope < 0, -slope, 1.0), 0.0), fits, far
+            return count + 1, h + where(far, value / where(slope < 0, -slope, 1.0), 0.0), fits, far
 
         begin = (jnp.asarray(0, dtype=jnp.int32), begun, jnp.ones_like(needed), needed)
         _, h, fits, _ = lax.while_loop(going, step, begin)
@@ -145,18 +157,18 @@ class Block(NamedTuple):
         for k, (y, w, a, half) in enumerate(zip(*self[:4], strict=True)):
             wide = plus(half, self.radius)
             if is_constant(a) and a == 0:  # it comes from the side that it moves away from
-                ways = [(jnp.where(w > 0, -y, y) - wide, -abs(w), 0.0)]
+                ways = [(where(w > 0, -y, y) - wide, -abs(w), 0.0)]
             else:
                 ways = [(y - wide, w, a), (-y - wide, -w, times(-1.0, a))]
             for gap, rate, pull in ways:
                 touches = abs(gap) <= 64.0 * self.noise
-                rate = jnp.where(left_behind & touches, jnp.maximum(rate, 0.0), rate)
-                h = _falls(jnp.where(touches, 0.0, gap), rate, pull)
+                rate = where(left_behind & touches, jnp.maximum(rate, 0.0), rate)
+                h = _falls(where(touches, 0.0, gap), rate, pull)
                 (h,) = shared([h])
-                at = jnp.where(jnp.isfinite(h), h, 0.0)
+                at = where(jnp.isfinite(h), h, 0.0)
                 for j in (k - 1, k - 2):
                     other = abs(self.place[j] + at * (self.rate[j] + self.pull[j] * at))
-                    h = jnp.where(other <= plus(self.half[j], self.radius), h, jnp.inf)
+                    h = where(other <= plus(self.half[j], self.radius), h, jnp.inf)
                 first = jnp.minimum(first, h)
         return first
 
@@ -176,20 +188,20 @@ _CONVEX = 32.0  # v^2 over r g / 2 of a ball near an edge, from which on the lev
 def _closing(gap: Any, rate: Any, pull: Number, square: Any) -> Any:
     """The root of gap + rate t + pull t^2 from above to below, of which `square` is the discriminant."""
     closes, edge = rate < 0, jnp.sqrt(square)
-    return jnp.where(closes, 2.0 * gap, rate + edge) / jnp.where(closes, edge - rate, _positive(-2.0 * pull))
+    return where(closes, 2.0 * gap, rate + edge) / where(closes, edge - rate, _positive(-2.0 * pull))
 
 
 def _falls(gap: Any, rate: Any, pull: Number) -> Any:
     """When gap + rate t + pull t^2 goes from above to below, if it is not yet to be below for good."""
     if is_constant(pull) and pull == 0:
-        return jnp.where((rate < 0) & (gap >= 0), gap / jnp.where(rate < 0, -rate, 1.0), jnp.inf)
+        return where((rate < 0) & (gap >= 0), gap / where(rate < 0, -rate, 1.0), jnp.inf)
     square = rate * rate - 4.0 * pull * gap
-    falls = (square > 0) & jnp.where(gap >= 0, (rate < 0) | jnp.asarray(pull < 0), (rate > 0) & jnp.asarray(pull < 0))
-    return jnp.where(falls, _closing(gap, rate, pull, jnp.where(falls, square, 1.0)), jnp.inf)
+    falls = (square > 0) & where(gap >= 0, (rate < 0) | jnp.asarray(pull < 0), (rate > 0) & jnp.asarray(pull < 0))
+    return where(falls, _closing(gap, rate, pull, where(falls, square, 1.0)), jnp.inf)
 
 
 def _positive(x: Number) -> Number:
-    return x if is_constant(x) and x > 0 else jnp.where(jnp.asarray(x > 0), x, 1.0)
+    return x if is_constant(x) and x > 0 else where(jnp.asarray(x > 0), x, 1.0)
 
 
 def _are_apart(a: Any, b: Any) -> bool:
@@ -223,7 +235,7 @@ def hop(
     steps = shared(found)
     h, which = steps[0], jnp.zeros_like(left)
     for i, step in enumerate(steps[1:], 1):
-        which = jnp.where(step < h, float(i), which)
+        which = where(step < h, float(i), which)
         h = jnp.minimum(h, step)
     hits, hops = h <= left, jnp.isfinite(left) & (h >= 0)
     for i, wall in enumerate(walls):
@@ -233,23 +245,23 @@ def hop(
             if other is not wall and not _are_apart(wall, other):
                 unusual = unusual | other.is_near(h)
         hops = hops if unusual is False else hops & ~(there & unusual)
-    choice = jnp.where(hops, jnp.where(hits, jnp.where(full, FULL - which, which), ENDS), PAUSES)
-    duration = jnp.where(going & hops, jnp.minimum(h, left), 0.0)
-    choice = jnp.where(going, choice, PAUSES)
+    choice = where(hops, where(hits, where(full, FULL - which, which), ENDS), PAUSES)
+    duration = where(going & hops, jnp.minimum(h, left), 0.0)
+    choice = where(going, choice, PAUSES)
     duration, choice = shared([duration, choice])
     return Hop(duration, choice, _moved(duration, choice, gravity, kicked, state))
 
 
 def hop_again(walls: Sequence[Wall], gravity: Vector3, kicked: Callable, touching: Any, choice: Any, left: Any, state):
     """Duration and end of a hop between planes that `hop` has found, with derivatives; only one plane is asked for."""
-    which, hits = jnp.where(choice > FULL, choice, FULL - choice), (choice >= 0) | (choice <= FULL)
-    gap, rate, pull = (select(which, column) for column in zip(*[(w.gap, w.rate, w.pull) for w in walls], strict=True))
-    gap = jnp.where(touching == which, 0.0, gap)
+    which, hits = where(choice > FULL, choice, FULL - choice), (choice >= 0) | (choice <= FULL)
+    gap, rate, pull = Choice(which, len(walls)).vector([(w.gap, w.rate, w.pull) for w in walls])
+    gap = where(touching == which, 0.0, gap)
     if is_constant(pull) and pull == 0:
-        h = gap / jnp.where(hits, -rate, 1.0)
+        h = gap / where(hits, -rate, 1.0)
     else:
-        h = _closing(gap, rate, pull, jnp.where(hits, rate * rate - 4.0 * pull * gap, 1.0))
-    (duration,) = shared([jnp.where(hits, h, jnp.where(choice == ENDS, left, 0.0))])
+        h = _closing(gap, rate, pull, where(hits, rate * rate - 4.0 * pull * gap, 1.0))
+    (duration,) = shared([where(hits, h, where(choice == ENDS, left, 0.0))])
     return duration, _moved(duration, choice, gravity, kicked, state)
 
 
@@ -259,5 +271,5 @@ def _moved(duration: Any, choice: Any, gravity: Vector3, kicked: Callable, state
     position = add(x, scale(duration, add(v, scale(times(0.5, duration), gravity))))
     velocity = add(v, scale(duration, gravity))
     after, turned = kicked(choice, position, velocity, spin)
-    keep = lambda new, old: tuple(b if a is b else jnp.where(struck, a, b) for a, b in zip(new, old, strict=True))  # noqa: E731
+    keep = lambda new, old: tuple(b if a is b else where(struck, a, b) for a, b in zip(new, old, strict=True))  # noqa: E731
     return position, keep(after, velocity), keep(turned, spin)

@@ -21,7 +21,6 @@ from .._math import (
     gradient_of,
     is_constant,
     reach_of,
-    select,
     value_of,
 )
 from .checks import conditions, fit, refuse, refuse_shapes
@@ -269,20 +268,20 @@ class LagrangianSystem(AbstractSystem):
         q = q if self.retraction is None else self.retraction(q)
         return q, self._projected(q, v, time)
 
-    def follows(self, contact, time, state, bounced, left, rests, ends):
+    def meets(self, contact, time, state, left, rests, ends):
         q, v = state
         fits = [fit(self, i, time, q, v.shape[0]) for i in range(self.n_contacts)]
-        fitting = jnp.stack([jnp.all(jnp.stack([holds for holds, _ in each.values()])) for each in fits])
-        kind, fault = bounces(ends)
-        return kind, RESULTS.where(fitting[contact], fault, RESULTS.barrier_conflict)
+        fitting = contact.of([jnp.all(jnp.stack([holds for holds, _ in each.values()])) for each in fits])
+        met = bounces(ends, self.bounced(contact, time, state))
+        return met._replace(fault=RESULTS.where(fitting, met.fault, RESULTS.barrier_conflict))
 
-    def impact(self, contact, time, state, bounced, kind):
-        return bounced, 0.0
+    def after(self, contact, time, state, kind):
+        return self.bounced(contact, time, state), 0.0
 
     def bounced(self, contact, time, state):
         """(6.1), with the rows of every barrier of the same restitution that is hit at this instant."""
         q, v = state
-        restitution = select(contact, [jnp.asarray(barrier.restitution, q.dtype) for barrier in self.barriers])
+        restitution = contact.of([jnp.asarray(barrier.restitution, q.dtype) for barrier in self.barriers])
         w = frozen(self.rate(q, v))
         blocks, offsets = [], []
         for i, barrier in enumerate(self.barriers):
@@ -290,7 +289,7 @@ class LagrangianSystem(AbstractSystem):
             offset = barrier.moves(q, time, rows.shape[0])
             if self.n_contacts > 1:
                 closing = matmul(jax.grad(barrier.gap)(q), w) < 0
-                hit = (contact == i) | (self.touches(i, q) & closing & (barrier.restitution == restitution))
+                hit = contact.is_(i) | (self.touches(i, q) & closing & (barrier.restitution == restitution))
                 rows, offset = jnp.where(hit, rows, 0.0), jnp.where(hit, offset, 0.0)
             blocks.append(rows)
             offsets.append(offset)
@@ -301,10 +300,7 @@ class LagrangianSystem(AbstractSystem):
         return state
 
     def named(self, contact, state):
-        return contact
-
-    def is_at_rest(self, contact, time, before, after):
-        return jnp.asarray(False)
+        return contact.index
 
     def prepared(self, time, state):
         return state
@@ -315,7 +311,10 @@ class LagrangianSystem(AbstractSystem):
     def level(self, contact, time, q, state):
         return value_of(self.barriers[contact].gap, q)
 
-    def face(self, contact, time, q):
+    def is_parabolic(self, contact):
+        return False
+
+    def returns(self, contact, time, q, v, half_a):
         return None
 
     def reach(self, contact, q):
@@ -358,7 +357,7 @@ class LagrangianSystem(AbstractSystem):
 
     def contact_frame(self, contact, time, state):
         gradients = jnp.stack([jnp.stack(gradient_of(each.gap, components(state[0]))) for each in self.barriers])
-        return state[0], gradients[contact]
+        return state[0], gradients[contact.index]
 
     def hopper(self, state):
         return None

@@ -29,7 +29,7 @@ from .._math import (
     times,
     total,
     unit,
-    where_number,
+    where,
 )
 from .surface import AbstractSurface, check, nonzero, positive
 
@@ -41,7 +41,7 @@ def _perpendicular(axis: Vector3) -> tuple[Vector3, Vector3]:
         helper = min(range(3), key=lambda i: abs(axis[i]))
         first = unit(cross(axis, tuple(1.0 if i == helper else 0.0 for i in range(3))))  # pyright: ignore
     else:  # Duff et al., J. Comput. Graph. Tech. 6(1), 2017: no singular direction
-        sign = where_number(z >= 0, 1.0, -1.0)
+        sign = where(z >= 0, 1.0, -1.0)
         a = -1.0 / (sign + z)
         first = (1.0 + sign * x * x * a, sign * x * y * a, -sign * x)
     return first, cross(axis, first)

@@ -12,6 +12,8 @@ from jax import lax
 
 from .._impact import collide_with_all, is_one_mu
 from .._math import (
+    Choice,
+    Number,
     Vector3,
     Window,
     add,
@@ -23,20 +25,19 @@ from .._math import (
     plus,
     ratio,
     scale,
-    select,
-    select_vector,
     shared,
     subtract,
     times,
     total,
     turned,
+    where,
 )
 from .air import Air
 from .ball import Ball, BallState, check_ball_state
 from .box import AbstractBlock, along
 from .hops import Block, Hopper, Wall, hop, hop_again
 from .surface import AbstractSurface, Plane
-from .system import AbstractSystem, bounces, rounding
+from .system import AbstractSystem, bounces, magnitude, rounding
 
 
 class Flight(NamedTuple):
@@ -128,68 +129,75 @@ class Scene(AbstractSystem):
             orientation = turned(orientation, angle)
         return Flight(q, v, state.spin, orientation)
 
-    def follows(self, contact, time, state, bounced, left, rests, ends):
-        return bounces(ends)
+    def meets(self, contact, time, state, left, rests, ends):
+        return bounces(ends, self.bounced(contact, time, state))
+
+    def after(self, contact, time, state, kind):
+        return self.bounced(contact, time, state), 0.0
 
     def during(self, contact, time, state, elapsed):
         return state
 
     def named(self, contact, state):
-        return contact
-
-    def is_at_rest(self, contact, time, before, after):
-        return jnp.asarray(False)
+        return contact.index
 
     def phase(self, state):
         return jnp.asarray(-1, dtype=jnp.int32)
 
-    def impact(self, contact, time, state, bounced, kind):
-        return bounced, 0.0
-
     def bounced(self, contact, time, state):
-        """Theorem 5.2 for any normal and any law; at a corner, (4.2) for all that is hit if that has one mu."""
-        single = self._single_impact(contact, time, state)
+        return self.struck(contact, time, state)[1]
+
+    def normals(self, time: Any, x: Vector3) -> list[Vector3]:
+        """Those of all surfaces, at a place."""
+        return [surface.direction(x, time) for surface in self.surfaces]
+
+    def restitution(self, contact: Choice) -> Number:
+        return contact.of([surface.law.restitution for surface in self.surfaces])
+
+    def struck(self, contact: Choice, time: Any, state: Flight) -> tuple[Vector3, Flight]:
+        """The normal of a contact, and the state after an impact there: by Theorem 5.2, for any normal and any law; at
+        a corner by (4.2), for all that is hit if that has one mu."""
+        normals = self.normals(time, state.position)
+        n = shared(contact.vector(normals))
+        velocity, spin = self._after(contact, n, state.velocity, state.spin)
+        single = state._replace(velocity=velocity, spin=spin)
         alike = [i for i, surface in enumerate(self.surfaces) if is_one_mu(surface.law)]
         if len(alike) < 2:
-            return single
-        hits = [self._is_hit_with(contact, i, time, state) for i in alike]
-        several = total([jnp.where(hit, 1.0, 0.0) for hit in hits]) > 1.5
+            return n, single
+        mu, known, size = self.restitution(contact), contact.among(alike), magnitude(state.position)
+
+        def is_hit_too(i: int) -> Any:
+            """Whether a surface is touched and closed in on when another one is hit that has the same mu."""
+            touches = abs(self.level(i, time, state.position, state)) <= 16.0 * rounding(self, i, size, time.dtype)
+            closes, law = dot(normals[i], state.velocity) < 0, self.surfaces[i].law
+            same = True if law.restitution is mu else jnp.asarray(law.restitution == mu)
+            return known & (contact.is_(i) | (touches & closes & same))
+
+        hits = [is_hit_too(i) for i in alike]
+        several = total([where(hit, 1.0, 0.0) for hit in hits]) > 1.5
 
         def at_corner(_):
-            surfaces = [self.surfaces[i] for i in alike]
-            laws, normals = [each.law for each in surfaces], [each.direction(state.position, time) for each in surfaces]
-            mu = select(contact, [surface.law.restitution for surface in self.surfaces])
-            radius, alpha = self.ball.radius, self.ball.inertia_ratio
-            velocity, spin = collide_with_all(radius, alpha, laws, normals, hits, mu, state.velocity, state.spin)
-            return as_arrays(state._replace(velocity=velocity, spin=spin))
+            laws = [self.surfaces[i].law for i in alike]
+            directions = [normals[i] for i in alike]
+            velocity, spin = collide_with_all(
+                self.ball.radius, self.ball.inertia_ratio, laws, directions, hits, mu, state.velocity, state.spin
+            )
+            return as_arrays((velocity, spin))
 
         as_arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=time.dtype), tree)  # noqa: E731
-        corner = lax.cond(eqxi.unvmap_any(several), at_corner, lambda one: one, as_arrays(single))
-        return jax.tree.map(lambda a, b: jnp.where(several, a, b), corner, single)
+        both = as_arrays((velocity, spin))
+        corner = lax.cond(eqxi.unvmap_any(several), at_corner, lambda one: one, both)
+        velocity, spin = jax.tree.map(lambda a, b: where(several, a, b), corner, both)
+        return n, state._replace(velocity=velocity, spin=spin)
 
-    def _is_hit_with(self, contact: Any, other: int, time: Any, state: Flight) -> Any:
-        """Whether a surface is touched and closed in on when another one is hit that has the same mu."""
-        surface, x = self.surfaces[other], state.position
-        touches = abs(self.level(other, time, x, state)) <= 16.0 * rounding(self, other, x)
-        closes = dot(surface.direction(x, time), state.velocity) < 0
-        mu = select(contact, [each.law.restitution for each in self.surfaces])
-        known = jnp.any(jnp.stack([contact == i for i, each in enumerate(self.surfaces) if is_one_mu(each.law)]))
-        return known & ((contact == other) | (touches & closes & jnp.asarray(surface.law.restitution == mu)))
-
-    def _single_impact(self, contact, time, state):
-        n = shared(select_vector(contact, [surface.direction(state.position, time) for surface in self.surfaces]))
-        velocity, spin = self._after(contact, n, state.velocity, state.spin)
-        return Flight(state.position, velocity, spin, state.orientation)
-
-    def _after(self, contact: Any, n: Vector3, velocity: Vector3, spin: Vector3, shared: Callable = shared) -> Any:
+    def _after(self, contact: Choice, n: Vector3, velocity: Vector3, spin: Vector3, shared: Callable = shared) -> Any:
         """Velocity and spin after an impact on one surface, with the normal there."""
         ball = self.ball
-        e_n = select(contact, [surface.law.restitution for surface in self.surfaces])
-        closing = dot(n, velocity)
+        e_n, closing = self.restitution(contact), dot(n, velocity)
         slip = subtract(subtract(velocity, scale(ball.radius, cross(spin, n))), scale(closing, n))
         closing, *slip = shared([closing, *slip])
         sizes = (ball.inertia_ratio, abs(closing), dot(slip, slip))
-        s = select(contact, [surface.law.slip_factor(*sizes) for surface in self.surfaces])
+        s = contact.of([surface.law.slip_factor(*sizes) for surface in self.surfaces])
         s, rebound = shared([s, times(plus(1.0, e_n), closing)])
         kick = add(scale(rebound, n), scale(s, slip))
         twist = times(s, ratio(1.0, times(ball.inertia_ratio, ball.radius)))
@@ -225,7 +233,7 @@ class Scene(AbstractSystem):
         walls, origin, zero = [], (0.0, 0.0, 0.0), jnp.zeros_like(left)
         half_g, v = scale(0.5, g), state.velocity
         for i, surface in enumerate(self.surfaces):
-            noise = rounding(self, i, x)
+            noise = rounding(self, i, magnitude(x), left.dtype)
             if isinstance(surface, AbstractBlock):
                 place, axes, half = surface.in_frame(x)
                 walls.append(Block(place, along(v, axes), along(half_g, axes), half, self.ball.radius, noise))
@@ -235,7 +243,8 @@ class Scene(AbstractSystem):
                 walls.append(Wall(n, gap, dot(n, v), dot(n, half_g), noise, there))
 
         def kicked(choice, position, velocity, spin):
-            n = select_vector(choice, [surface.direction(position, 0.0) for surface in self.surfaces])
+            choice = Choice(choice, len(self.surfaces))
+            n = choice.vector(self.normals(0.0, position))
             # Only the slip is shared: each number more is one more pass over the batch.
             return self._after(choice, n, velocity, spin, lambda x: (x[0], *shared(x[1:])) if len(x) > 2 else x)
 
@@ -244,10 +253,13 @@ class Scene(AbstractSystem):
     def level(self, contact, time, q, state):
         return self.surfaces[contact].level(q, time, self.ball.radius)
 
-    def face(self, contact, time, q):
+    def is_parabolic(self, contact):
+        return self.surfaces[contact].is_parabolic
+
+    def returns(self, contact, time, q, v, half_a):
         law = self.surfaces[contact].law  # elastic bounces stay high
         elastic = is_constant(law.restitution) and law.restitution == 1
-        return None if elastic else self.surfaces[contact].face(q, time)
+        return None if elastic else self.surfaces[contact].returns(q, v, half_a, time)
 
     def reach(self, contact, q):
         return self.surfaces[contact].reach(q, self.ball.radius)
@@ -262,15 +274,15 @@ class Scene(AbstractSystem):
         return plus(self.surfaces[contact].extent(), self.ball.radius)
 
     def is_admissible(self, time, state):
-        leaves = jax.tree.leaves((self, state))
-        holds = [jnp.all(jnp.isfinite(jnp.asarray(leaf))) for leaf in leaves]
-        holds += [jnp.asarray(value > 0) for value in (self.ball.radius, self.ball.mass, self.ball.inertia_ratio)]
+        leaves = [leaf for leaf in jax.tree.leaves((self, state)) if not is_constant(leaf)]
+        holds: list = [jnp.all(jnp.isfinite(leaf)) for leaf in leaves]
+        holds += [value > 0 for value in (self.ball.radius, self.ball.mass, self.ball.inertia_ratio)]
+        size = magnitude(state.position)
         for i, surface in enumerate(self.surfaces):
-            checks = [*surface.is_proper(self.ball.radius), *surface.law.admissible()]
-            holds += [jnp.asarray(check) for check, _ in checks]
-            depth = self.level(i, time, state.position, state) + 16.0 * rounding(self, i, state.position)
-            holds.append(jnp.asarray(depth >= 0))
-        return functools.reduce(jnp.logical_and, holds)
+            holds += [check for check, _ in (*surface.is_proper(self.ball.radius), *surface.law.admissible())]
+            depth = self.level(i, time, state.position, state) + 16.0 * rounding(self, i, size, time.dtype)
+            holds.append(depth >= 0)
+        return functools.reduce(jnp.logical_and, [x for x in holds if x is not True], jnp.asarray(True))
 
     def received(self, state, batch, t0):
         check_ball_state(state, batch)
@@ -289,7 +301,7 @@ class Scene(AbstractSystem):
         return BallState(parts[0], parts[1], parts[2], state.orientation)
 
     def contact_frame(self, contact, time, state: Flight):
-        n = select_vector(contact, [surface.direction(state.position, time) for surface in self.surfaces])
+        n = contact.vector(self.normals(time, state.position))
         n = tuple(jnp.asarray(c, dtype=time.dtype) for c in n)
         point = subtract(state.position, scale(self.ball.radius, n))
         return jnp.stack(point), jnp.stack(n)

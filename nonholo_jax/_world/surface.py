@@ -1,7 +1,7 @@
 """Surfaces: where they are, which way they face, and bounds that let a crossing be found without passing it."""
 
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -41,11 +41,23 @@ class Face(NamedTuple):
     below: Any  # whether the ball's centre is over it, not over an edge
 
 
+class Return(NamedTuple):
+    """A parabola that begins on a flat face and comes back to it. Until then it is on the outer side of the face's
+    plane, so that it cannot meet the surface before."""
+
+    duration: Number
+    comes: Any  # whether it comes back, to the same face
+    rise: Number  # its speed away from the face
+    pull: Number  # half its acceleration towards the face
+
+
 class AbstractSurface(eqx.Module):
     """A surface that the ball bounces on. Subclasses say, by components and for a point x, the signed `distance`, the
     `direction` from the surface to the point, and a bound of the second derivative of the `level` along a path."""
 
     law: eqx.AbstractVar[AbstractContactLaw]
+    has_edges: ClassVar[bool] = False  # whether its flat faces, if there are any, end somewhere
+    is_parabolic: ClassVar[bool] = False  # whether the level along every parabola is one itself
 
     def __check_init__(self):
         if not isinstance(self.law, AbstractContactLaw):
@@ -82,6 +94,12 @@ class AbstractSurface(eqx.Module):
     def face(self, x: Vector3, t: Number) -> Face | None:
         """The flat piece that a ball at `x` would roll on; `None` for a surface that has none."""
         del x, t
+        return None
+
+    def returns(self, x: Vector3, v: Vector3, half_a: Vector3, t: Number) -> Return | None:
+        """When a parabola that begins on a flat face comes back to it, from the velocity v and half the acceleration
+        alone; `None` for a surface on which the level itself says so."""
+        del x, v, half_a, t
         return None
 
     def clearance(self, x: Vector3, t: Number, radius: Number) -> Number:
@@ -137,6 +155,7 @@ class Plane(AbstractSurface):
     point: Any = eqx.field(converter=as_vector)
     facing: Any = eqx.field(converter=as_vector)
     law: AbstractContactLaw
+    is_parabolic: ClassVar[bool] = True
 
     def __init__(self, point: Any, normal: Any, law: AbstractContactLaw):
         self.point, self.facing, self.law = as_vector(point), as_vector(normal), law
@@ -210,6 +229,12 @@ class Implicit(AbstractSurface):
 
     def direction(self, x, t):
         return unit(gradient_of(lambda p: self.function(p, t), x))
+
+    def returns(self, x: Vector3, v: Vector3, half_a: Vector3, t: Number) -> Return | None:
+        """When a parabola that begins on a flat face comes back to it, from the velocity v and half the acceleration
+        alone; `None` for a surface on which the level itself says so."""
+        del x, v, half_a, t
+        return None
 
     def clearance(self, x, t, radius):
         return 0.0  # a gap with any slope tells no distance

@@ -2,14 +2,25 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._math import KINDS, RESULTS, Index, Interval, Number, Scalar, Window, is_constant, plus, times, total
+from .._math import KINDS, RESULTS, Choice, Index, Interval, Number, Scalar, Window, plus, times, total
 from .hops import Hopper
+from .surface import Return
+
+
+class Meeting(NamedTuple):
+    """What happens when a contact is crossed."""
+
+    kind: KINDS
+    fault: RESULTS  # `reached_t1` if the motion can go on, or why not
+    after: Any  # the state afterwards
+    pause: Scalar | float  # how many seconds have passed by then
+    is_at_rest: Any  # nothing moves any more
 
 
 class AbstractSystem(eqx.Module):
@@ -42,32 +53,26 @@ class AbstractSystem(eqx.Module):
         """The state at `time`, after smooth motion from `state` to (q, v) during `duration` seconds."""
 
     @abstractmethod
-    def bounced(self, contact: Index, time: Scalar, state: Any) -> Any:
-        """The state after an impact on the contact of that index, if nothing but a bounce follows."""
+    def bounced(self, contact: Choice, time: Scalar, state: Any) -> Any:
+        """The state after an impact on that contact, if nothing but a bounce follows."""
 
     @abstractmethod
-    def follows(
-        self, contact: Index, time: Scalar, state: Any, bounced: Any, left: Scalar, rests: Any, ends: Any
-    ) -> tuple[KINDS, RESULTS]:
-        """What follows when a contact is crossed in `state`, `left` seconds before the end, and whether the motion can
-        go on (`RESULTS.reached_t1`) or why not. `rests` says that a bounce would not rise above rounding, `ends` that
-        it could not even be computed."""
+    def meets(self, contact: Choice, time: Scalar, state: Any, left: Scalar, rests: Any, ends: Any) -> Meeting:
+        """What happens when a contact is crossed in `state`, `left` seconds before the end. `rests` says that a bounce
+        would not rise above rounding, `ends` that it could not even be computed."""
 
     @abstractmethod
-    def impact(self, contact: Index, time: Scalar, state: Any, bounced: Any, kind: KINDS) -> tuple[Any, Scalar | float]:
-        """The state after crossing a contact, given what follows, and how many seconds have passed by then."""
+    def after(self, contact: Choice, time: Scalar, state: Any, kind: KINDS) -> tuple[Any, Scalar | float]:
+        """The state after a contact is crossed, and how many seconds have passed by then, if it is known what kind of
+        impact it is: the same as in `meets`, for derivatives."""
 
     @abstractmethod
-    def during(self, contact: Index, time: Scalar, state: Any, elapsed: Scalar) -> Any:
+    def during(self, contact: Choice, time: Scalar, state: Any, elapsed: Scalar) -> Any:
         """The state `elapsed` seconds after a contact was crossed in `state`, within the time that `impact` takes."""
 
     @abstractmethod
-    def named(self, contact: Index, state: Any) -> Index:
+    def named(self, contact: Choice, state: Any) -> Index:
         """The contact that the log names, and that is touched afterwards: that itself, but for the edges of a face."""
-
-    @abstractmethod
-    def is_at_rest(self, contact: Index, time: Scalar, before: Any, after: Any) -> Bool[Array, ""]:
-        """Whether nothing moves any more after an impact."""
 
     @abstractmethod
     def phase(self, state: Any) -> Index:
@@ -79,12 +84,17 @@ class AbstractSystem(eqx.Module):
         is the one at which the arc began."""
 
     @abstractmethod
-    def face(self, contact: int, time: Scalar, q: tuple) -> Any:
-        """The flat `Face` of a surface that q is on, if low bounces on it are to be exact, else `None`."""
+    def is_parabolic(self, contact: int) -> bool:
+        """Whether the level along every parabola is one itself: `bend` is then exact over the whole arc."""
+
+    @abstractmethod
+    def returns(self, contact: int, time: Scalar, q: tuple, v: tuple, half_a: tuple) -> Return | None:
+        """When a parabola that begins on a flat face of a surface comes back to it, if low bounces on it are to be
+        exact, else `None`."""
 
     @abstractmethod
     def reach(self, contact: int, q: tuple) -> Number | None:
-        """A length over which `bend` is worth asking for; `None` if it is as good over the whole arc."""
+        """A length over which `bend` is worth asking for; `None` if there is no such length."""
 
     @abstractmethod
     def bend(self, contact: int, time: Scalar, window: Window, state: Any) -> Interval:
@@ -115,7 +125,7 @@ class AbstractSystem(eqx.Module):
         """The user's form of an engine's state."""
 
     @abstractmethod
-    def contact_frame(self, contact: Index, time: Scalar, state: Any) -> tuple[Array, Array]:
+    def contact_frame(self, contact: Choice, time: Scalar, state: Any) -> tuple[Array, Array]:
         """The point of contact and the gradient of the gap there."""
 
     @abstractmethod
@@ -128,13 +138,18 @@ class AbstractSystem(eqx.Module):
         """The same system with nothing to hit."""
 
 
-def bounces(ends: Any) -> tuple[KINDS, RESULTS]:
-    """What follows an impact where nothing but a bounce can: `follows` of a system without other phases."""
+def bounces(ends: Any, after: Any) -> Meeting:
+    """What an impact leads to where nothing but a bounce can follow."""
     kind = KINDS.where(ends, KINDS.unused, KINDS.bounce)
-    return kind, RESULTS.where(ends, RESULTS.sustained_contact, RESULTS.reached_t1)
+    fault = RESULTS.where(ends, RESULTS.sustained_contact, RESULTS.reached_t1)
+    return Meeting(kind, fault, after, 0.0, False)
 
 
-def rounding(system: AbstractSystem, contact: int, q: Sequence[Number]) -> Number:
+def magnitude(q: Sequence[Number]) -> Number:
+    """The size of the numbers of a configuration, as their rounding goes by it."""
+    return total([abs(c) for c in q])
+
+
+def rounding(system: AbstractSystem, contact: int, size: Number, dtype: Any) -> Number:
     """The rounding error of a level in m: a few eps of the numbers that it is computed from."""
-    dtype = jnp.result_type(*[c for c in q if not is_constant(c)])
-    return times(8.0 * float(jnp.finfo(dtype).eps), plus(total([abs(c) for c in q]), system.extent(contact)))
+    return times(8.0 * float(jnp.finfo(dtype).eps), plus(size, system.extent(contact)))
