@@ -29,7 +29,7 @@ from nonholo_jax import (
     Sphere,
 )
 from nonholo_jax._math.types import result_name
-from nonholo_jax._math.vector import select
+from nonholo_jax._math import Choice
 
 # Compiled for derivatives by the dozen, each run once: without the slow passes of the compiler.
 fast_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
@@ -65,11 +65,11 @@ class AnyLaw(AbstractContactLaw):
 
     @property
     def restitution(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return select(self.index, [jnp.asarray(law.restitution) for law in self.laws])
+        return Choice(self.index, len(self.laws)).of([jnp.asarray(law.restitution) for law in self.laws])
 
     def slip_factor(self, inertia_ratio, closing_speed, slip_squared):
         sizes = (inertia_ratio, closing_speed, slip_squared)
-        return select(self.index, [jnp.asarray(law.slip_factor(*sizes)) for law in self.laws])
+        return Choice(self.index, len(self.laws)).of([jnp.asarray(law.slip_factor(*sizes)) for law in self.laws])
 
     def admissible(self):
         return [check for law in self.laws for check in law.admissible()]

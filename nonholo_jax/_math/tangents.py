@@ -10,9 +10,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -21,18 +23,23 @@ from .tiles import by_tiles
 
 
 class Iteration(NamedTuple):
-    """A program whose derivatives are asked for: some steps on numbers, of which some move with the arguments."""
+    """A program whose derivatives are asked for: steps on numbers, of which some move with the arguments. The steps
+    come in parts. A part is first looked through without derivatives; each of its steps is then known by a row."""
 
     begin: (
         Callable  # of the arguments: what stays (a pytree without derivatives) and what moves (floating-point arrays)
     )
-    count: Callable  # of what stays, and of the hint: how many steps there are to make, the same for all lanes
-    look: Callable  # of the arguments, the number of the step, and what stays: the latter, afterwards, and a path
-    follow: Callable  # of the arguments, the number of the step, what `look` returned, and what moves: what stays and
-    # what moves, afterwards
+    parts: Callable  # of what stays, and of the hint: how many parts there are, the same for all lanes
+    look: Callable  # of the arguments, the number of the part, and what stays: the latter, afterwards; how many steps
+    # the part has; and their rows, a pytree of arrays with an axis in front
+    harmless: Callable  # of the arguments, and of what stays: arguments with which idle steps are numbers, too
+    starts: Callable  # of a row: what moves, where the step begins
+    step: Callable  # of the arguments, a row, and what moves: the latter, afterwards, and a record
+    place: Callable  # of a row: where its record stands in the table, which has room for no other place
+    table: np.ndarray  # of zeros, for the records
     finished: Callable  # of what stays: whether there was no step too few
-    of: Callable  # of what moves in the end: what is asked for, linear in it
-    most: int  # steps
+    of: Callable  # of what moves in the end, and of the table: what is asked for, linear in both
+    most: int  # parts
 
 
 class _Linear(NamedTuple):
@@ -167,15 +174,44 @@ def _pushed(iteration: Iteration, hint: Any, arguments: Callable, at: list, numb
     begin = lambda at: iteration.begin(arguments(at))[::-1]  # noqa: E731
     moving, tangent, stays = jax.jvp(begin, (at,), (numbers,), has_aux=True)
 
-    def step(i: Any, carry: tuple) -> tuple:
-        stays, moving, tangent = carry
-        seen, path = iteration.look(arguments(at), i, stays)
-        after = lambda at, moving: iteration.follow(arguments(at), i, seen, path, moving)[::-1]  # noqa: E731
-        moving, tangent, stays = jax.jvp(after, (at, moving), (numbers, tangent), has_aux=True)
-        return stays, moving, tangent
+    def part(i: Any, carry: tuple) -> tuple:
+        stays, tangent, table = carry
+        stays, count, rows = iteration.look(arguments(at), i, stays)
 
-    stays, moving, tangent = lax.fori_loop(0, iteration.count(stays, hint), step, (stays, moving, tangent))
-    return _known(iteration.finished(stays), jax.jvp(iteration.of, (moving,), (tangent,))[1])
+        def one(j: Any, carry: tuple) -> tuple:
+            tangent, table = carry
+            row = _row(rows, j)
+            after = lambda at, moving: iteration.step(arguments(at), row, moving)  # noqa: E731
+            new, record = jax.jvp(after, (at, iteration.starts(row)), (numbers, tangent))[1]
+            used = j < count
+            return _kept(used, new, tangent), _entered(table, iteration.place(row), used, record)
+
+        return stays, *lax.fori_loop(0, eqxi.unvmap_max(count), one, (tangent, table))
+
+    first = (stays, tangent, jnp.asarray(iteration.table))
+    parts = iteration.parts(stays, hint)
+    stays, tangent, table = part(0, first) if iteration.most == 1 else lax.fori_loop(0, parts, part, first)
+    asked = jax.jvp(iteration.of, (moving, jnp.asarray(iteration.table)), (tangent, table))[1]
+    return _known(iteration.finished(stays), asked)
+
+
+def _row(rows: Any, j: Any) -> Any:
+    return jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, j, keepdims=False), rows)
+
+
+def _kept(used: Any, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(used, a, b), new, old)
+
+
+def _entered(table: Any, place: Any, used: Any, record: Any) -> Any:
+    """The table with a record more."""
+    return table.at[jnp.where(used, place, table.shape[0])].set(record, mode="drop") if table.size else table
+
+
+def _record(table: Any, place: Any) -> Any:
+    """The record at a place, zeros for a place that there is none of."""
+    zeros = jnp.zeros(table.shape[1:], table.dtype)
+    return table.at[place].get(mode="fill", fill_value=0.0) if table.size else zeros
 
 
 def _known(finished: Any, numbers: Any) -> Any:
@@ -186,69 +222,90 @@ def _known(finished: Any, numbers: Any) -> Any:
 class _Pull(NamedTuple):
     """How far the way back is."""
 
-    part: Any  # the step that comes next, and what it begins with
+    part: Any  # which is looked through next, and what it begins with
     stays: Any
-    moving: Any
-    goal: Any  # the step whose transpose comes next
-    kept: Any  # what steps begin with, in slots
+    goal: Any  # the part whose transpose comes next
+    kept: Any  # what parts begin with, in slots
     cotangent: Any
     sums: Any
     finished: Any
 
 
 def _pulled(iteration: Iteration, hint: Any, arguments: Callable, at: list, cotangent: Any) -> list:
-    """The cotangent of the arguments that move. What steps begin with is kept in a few slots; from the nearest one the
+    """The cotangent of the arguments that move. What parts begin with is kept in a few slots; from the nearest one the
     others are found again, by the same instructions: a path found by others may differ by rounding in where a step
     ends, and would not fit to the next one."""
     begin = lambda at: iteration.begin(arguments(at))[::-1]  # noqa: E731
     moving, pull, stays = jax.vjp(begin, at, has_aux=True)
-    count = iteration.count(stays, hint)
+    cotangent, cotangents = jax.vjp(iteration.of, moving, jnp.asarray(iteration.table))[1](cotangent)
+    parts, sums = iteration.parts(stays, hint), [jnp.zeros_like(x) for x in at]
     slots = min(iteration.most, _SLOTS)
-    stride = jnp.maximum(-(-count // slots), 1)
-    (cotangent,) = jax.vjp(iteration.of, moving)[1](cotangent)
-    kept = jax.tree.map(lambda x: jnp.broadcast_to(x, (slots, *jnp.shape(x))), (stays, moving))
+    stride = jnp.maximum(-(-parts // slots), 1)
+    kept = jax.tree.map(lambda x: jnp.broadcast_to(x, (slots, *jnp.shape(x))), stays)
 
     def job(c: _Pull) -> _Pull:
-        seen, path = iteration.look(arguments(at), c.part, c.stays)
-        after = lambda at, moving: iteration.follow(arguments(at), c.part, seen, path, moving)[::-1]  # noqa: E731
+        stays, count, rows = iteration.look(arguments(at), c.part, c.stays)
+        here = c.part == c.goal
+        steps = jnp.where(here, eqxi.unvmap_max(count), 0)
 
-        def back(c: _Pull) -> _Pull:
-            _, pull, ended = jax.vjp(after, at, c.moving, has_aux=True)
-            more, cotangent = pull(c.cotangent)
-            sums = [a + b for a, b in zip(c.sums, more, strict=True)]
-            goal = c.goal - 1
-            slot = jnp.maximum(goal, 0) // stride
-            stays_there, moving_there = jax.tree.map(lambda column: column[slot], c.kept)
-            finished = c.finished | ((c.goal == count - 1) & iteration.finished(ended))
-            return _Pull(slot * stride, stays_there, moving_there, goal, c.kept, cotangent, sums, finished)
+        def one(k: Any, carry: tuple) -> tuple:
+            cotangent, sums = carry
+            j = steps - 1 - k
+            row, used = _row(rows, j), j < count
+            after = lambda at, moving: iteration.step(arguments(at), row, moving)  # noqa: E731
+            known = _record(cotangents, iteration.place(row))
+            more, new = jax.vjp(after, at, iteration.starts(row))[1]((cotangent, known))
+            # Not only added: the row of a step that there is none of may have derivatives that are no numbers.
+            return _kept(used, new, cotangent), _kept(used, jax.tree.map(jnp.add, sums, more), sums)
 
-        def on(c: _Pull) -> _Pull:
-            moving, stays = after(at, c.moving)
-            part = c.part + 1
-            slot = jnp.where(part % stride == 0, part // stride, slots)
-            kept = jax.tree.map(lambda column, x: column.at[slot].set(x, mode="drop"), c.kept, (stays, moving))
-            return c._replace(part=part, stays=stays, moving=moving, kept=kept)
+        cotangent, sums = lax.fori_loop(0, steps, one, (c.cotangent, c.sums))
+        if iteration.most == 1:
+            return c._replace(stays=stays, cotangent=cotangent, sums=sums, goal=c.goal - 1)
+        on, goal = c.part + 1, jnp.where(here, c.goal - 1, c.goal)
+        slot = jnp.where(here | (on % stride != 0), slots, on // stride)
+        kept = jax.tree.map(lambda column, x: column.at[slot].set(x, mode="drop"), c.kept, stays)
+        nearest = jnp.maximum(goal, 0) // stride
+        finished = c.finished | (here & (c.goal == parts - 1) & iteration.finished(stays))
+        stays = _kept(here, _row(kept, nearest), stays)
+        return _Pull(jnp.where(here, nearest * stride, on), stays, goal, kept, cotangent, sums, finished)
 
-        return back(c) if iteration.most == 1 else lax.cond(c.part == c.goal, back, on, c)
-
-    zero, sums = jnp.zeros_like(count), [jnp.zeros_like(x) for x in at]
-    first = _Pull(zero, stays, moving, count - 1, kept, cotangent, sums, iteration.finished(stays))
-    last = lax.while_loop(lambda c: c.goal >= 0, job, first)
-    return _known(last.finished, [a + b for a, b in zip(last.sums, pull(last.cotangent)[0], strict=True)])
+    zero = jnp.zeros_like(parts)
+    first = _Pull(zero, stays, parts - 1, kept, cotangent, sums, iteration.finished(stays))
+    if iteration.most == 1:
+        last = job(first._replace(goal=zero))
+        last = last._replace(finished=iteration.finished(last.stays))
+    else:
+        last = lax.while_loop(lambda c: c.goal >= 0, job, first)
+    return _known(last.finished, jax.tree.map(jnp.add, last.sums, pull(last.cotangent)[0]))
 
 
 def _all_steps(iteration: Iteration, hint: Any, arguments: Callable, at: Any) -> Any:
     """What moves in the end, in a way that JAX can differentiate as often as one likes."""
     stays, moving = iteration.begin(arguments(at))
-    count = iteration.count(stays, hint)
+    parts = iteration.parts(stays, hint)
 
-    def step(carry: tuple, i: Any) -> tuple:
+    def part(carry: tuple, i: Any) -> tuple:
         def run(carry: tuple) -> tuple:
-            stays, moving = carry
-            seen, path = iteration.look(arguments(at), i, stays)
-            return iteration.follow(arguments(at), i, seen, path, moving)
+            stays, *rest = carry
+            stays, count, rows = iteration.look(arguments(at), i, stays)
+            tame = iteration.harmless(arguments(at), stays)
 
-        return lax.cond(i < count, run, lambda carry: carry, carry), None
+            def one(carry: tuple, each: tuple) -> tuple:
+                j, row = each
 
-    body = step if iteration.most == 1 else jax.checkpoint(step, prevent_cse=False)
-    return iteration.of(lax.scan(body, (stays, moving), jnp.arange(iteration.most, dtype=jnp.int32))[0][1])
+                def make(carry: tuple) -> tuple:
+                    moving, table = carry
+                    new, record = iteration.step(tame, row, moving)
+                    return _kept(j < count, new, moving), _entered(table, iteration.place(row), j < count, record)
+
+                return lax.cond(eqxi.unvmap_any(j < count), make, lambda carry: carry, carry), None
+
+            index = jnp.arange(jax.tree.leaves(rows)[0].shape[0], dtype=jnp.int32)
+            return stays, *lax.scan(jax.checkpoint(one, prevent_cse=False), tuple(rest), (index, rows))[0]
+
+        return lax.cond(i < parts, run, lambda carry: carry, carry), None
+
+    first = (stays, moving, jnp.asarray(iteration.table))
+    body = part if iteration.most == 1 else jax.checkpoint(part, prevent_cse=False)
+    _, moving, table = lax.scan(body, first, jnp.arange(iteration.most, dtype=jnp.int32))[0]
+    return iteration.of(moving, table)

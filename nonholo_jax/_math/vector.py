@@ -118,7 +118,7 @@ def cross(a: Vector3, b: Vector3) -> Vector3:
     )
 
 
-def where(condition: Any, a: Numbers, b: Numbers) -> Any:
+def where(condition: Any, a: Any, b: Any) -> Any:
     """`jnp.where` of numbers in as few operations as it takes: none where the condition or the answer is known."""
     if isinstance(condition, bool | np.bool_):
         return a if condition else b
@@ -134,7 +134,7 @@ def where(condition: Any, a: Numbers, b: Numbers) -> Any:
     return lax.select(condition, a, b)
 
 
-def where_vector(condition: Any, a: Sequence[Numbers], b: Sequence[Numbers]) -> Any:
+def where_vector(condition: Any, a: Sequence, b: Sequence) -> Any:
     """`where`, component by component."""
     return tuple(where(condition, x, y) for x, y in zip(a, b, strict=True))
 
@@ -200,7 +200,7 @@ class Choice:
         """Whether it is one of these."""
         return functools.reduce(operator.or_, [self._flags[i] for i in numbers], False)
 
-    def of(self, options: Sequence[Number], numbers: Sequence[int] | None = None) -> Any:
+    def of(self, options: Sequence, numbers: Sequence[int] | None = None) -> Any:
         """The option of that number, and the last one for any number that has none; `numbers` are those of the options
         if they are not counted from 0. Folded where all options are the same constant."""
         known = list(zip(range(len(options)) if numbers is None else numbers, options, strict=True))
@@ -209,7 +209,7 @@ class Choice:
             result = where(self._flags[i], option, result)
         return result
 
-    def vector(self, options: Sequence[Sequence[Number]], numbers: Sequence[int] | None = None) -> Any:
+    def vector(self, options: Sequence[Sequence], numbers: Sequence[int] | None = None) -> Any:
         """`of`, component by component."""
         return tuple(self.of(column, numbers) for column in zip(*options, strict=True))
 

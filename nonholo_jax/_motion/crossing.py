@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -26,7 +27,6 @@ from .._math import (
     derivative,
     evaluate,
     frozen,
-    is_constant,
     norm,
     recentred,
     shared,
@@ -233,36 +233,28 @@ def _noise(system: AbstractSystem, contact: int, arc: Arc) -> float:
     return 4.0 * eps if _is_exact(system, contact, arc.configuration) else eps**0.5
 
 
-def _returns(system: AbstractSystem, contact: int, arc: Arc, s: Any) -> Any:
-    """Whether an arc begins on a plane, or on a flat face to which it comes back at s: then the search has found that
-    time from the velocity alone, and the level there, which is nothing but rounding, could only spoil it by rounding
-    over the speed."""
-    back = _return(system, contact, arc)
-    if back is None and not _is_exact(system, contact, arc.configuration):
-        return False
-    q = tuple(p[0] for p in arc.configuration)
-    noise = rounding(system, contact, total([abs(c) for c in q]), s.dtype)
-    touches = abs(system.level(contact, arc.time, q, arc.start)) <= noise
-    return touches if back is None else touches & back.comes & (abs(s - back.duration) <= 1e-9 * back.duration)
+@eqx.filter_custom_jvp
+def crossing_time(s: Scalar, contact: Index, system: AbstractSystem, arc: Arc) -> Scalar:
+    """The local time s at which a contact is crossed, found by `search`, with its derivatives in the arc and the
+    system: those of an implicit function. Where the rate of the level is not known (grazing) s has none."""
+    del contact, system, arc
+    return s
 
 
-def newton(arc: Arc, s: Scalar, value: Number, rate: Number, noise: Number) -> Scalar:
-    """One Newton step for the zero of a level. Where its rate is not known (grazing) `s` is kept."""
+@crossing_time.def_jvp
+def _crossing_time_jvp(primals: tuple, tangents: tuple) -> tuple:
+    s, index, system, arc = primals
+    contact, contacts = Choice(index, system.n_contacts), range(system.n_contacts)
+
+    def level(system: AbstractSystem, arc: Arc, s: Any) -> Any:
+        q = arc.position(s)
+        return contact.of([jnp.asarray(system.level(i, arc.time, q, arc.start), s.dtype) for i in contacts])
+
+    s = crossing_time(*primals)
+    _, rate = jax.jvp(lambda s: level(system, arc, s), (s,), (jnp.ones_like(s),))
+    _, change = eqx.filter_jvp(lambda system, arc: level(system, arc, s), (system, arc), tangents[2:])
+    # An arc that nothing cuts keeps its s: a division by nothing could overflow, and its derivative with it.
+    noise = where(index >= 0, contact.of([_noise(system, i, arc) for i in contacts]), jnp.inf)
     steep = jnp.abs(rate) > noise * frozen(norm(arc.tangent(s)))
-    s = s - where(steep, value / where(steep, rate, 1.0), 0.0)
-    return s - frozen(jnp.minimum(s, 0.0))  # not before the arc begins, with the derivative it has
-
-
-def corrected(system: AbstractSystem, arc: Arc, s: Scalar, contact: Choice) -> Scalar:
-    """The local time of a crossing found near `s`, differentiable in the arc and the system: two Newton steps, so
-    that second derivatives are right too."""
-    known, still, frame = frozen(s), frozen(arc), frozen(system)
-    s, contacts = known, range(system.n_contacts)
-    returns = contact.of([where(_returns(frame, i, still, s), 1.0, 0.0) for i in contacts])
-    # An arc that nothing cuts keeps its s: a Newton step to nowhere could overflow, and its derivative with it.
-    noise = where(contact.index >= 0, contact.of([_noise(system, i, arc) for i in contacts]), jnp.inf)
-    for _ in range(2):
-        q, tangent = arc.position(s), arc.tangent(s)
-        pairs = [slope(lambda x, i=i: system.level(i, arc.time, x, arc.start), q, tangent) for i in contacts]
-        (s,) = shared([newton(arc, s, *(contact.of(column) for column in zip(*pairs, strict=True)), noise)])
-    return s if is_constant(returns) and returns == 0 else where(returns > 0.5, known + (s - frozen(s)), s)
+    (slope,) = shared([where(steep, rate, 1.0)])
+    return s, where(steep, -change / slope, 0.0)

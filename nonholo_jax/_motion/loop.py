@@ -16,7 +16,7 @@ from jax import lax
 
 from .._math import KINDS, RESULTS, Choice, frozen, norm, shared, total, where
 from .._world import ENDS, FULL, PAUSES, AbstractSystem, Hopper, Meeting
-from .crossing import corrected, search
+from .crossing import crossing_time, search
 from .motion import AbstractMotion
 
 _MOST_IMPACTS_AT_ONCE = 32
@@ -40,12 +40,36 @@ class Log(NamedTuple):
     labels: Any  # contact, kind, and the phase that follows, or -1
 
 
-class Path(NamedTuple):
-    """What `replay` needs of every arc: its size in seconds (infinite for one that reaches as far as t1, whose size
-    has derivatives), where it was cut in local time, by which contact, and what kind of impact that was."""
+class Begun(NamedTuple):
+    """The numbers that an arc begins with."""
 
-    sizes: Any
-    labels: Any
+    time: Any
+    state: Any
+    memory: Any
+    since: Any
+
+
+class Path(NamedTuple):
+    """What derivatives need of every arc."""
+
+    numbers: Any  # size in seconds (infinite for one that reaches as far as t1, whose size has derivatives), where it
+    # was cut in local time, by how much rounding had put the time ahead, and what it began with
+    labels: Any  # by which contact it was cut, what kind of impact that was, flags, and the number of impacts before
+
+
+class Flags(NamedTuple):
+    """What is known of an arc, as bits of one label."""
+
+    jumped: Any  # it began with an impact
+    struck: Any  # it ended with one
+    reached: Any  # it ended at t1
+
+    def packed(self) -> Any:
+        return functools.reduce(lambda bits, flag: 2 * bits + flag.astype(jnp.int32), self, jnp.asarray(0, jnp.int32))
+
+    @classmethod
+    def unpacked(cls, bits: Any) -> "Flags":
+        return cls(*[(bits >> k) & 1 == 1 for k in (2, 1, 0)])
 
 
 class Outcome(NamedTuple):
@@ -90,18 +114,65 @@ def pack_row(row: Row) -> Any:
 
 def unpack_row(values: Any, like: Any) -> Row:
     """The rows of a log, leading axes kept; `like` is a state of the right structure."""
-    leaves, treedef = jax.tree.flatten(Row(jnp.zeros(()), jnp.zeros(()), jnp.zeros(()), like, like))
-    rows, start = [], 0
+    number = jnp.zeros(())
+    return columns(values, Row(number, number, number, like, like))
+
+
+def columns(values: Any, like: Any) -> Any:
+    """A pytree from its numbers in the last axis, in the dtypes of `like`; leading axes are kept."""
+    leaves, treedef = jax.tree.flatten(like)
+    found, start = [], 0
     for leaf in leaves:
-        stop = start + jnp.size(leaf)
-        part = values[..., start:stop]
-        rows.append(part[..., 0] if jnp.ndim(leaf) == 0 else part)
-        start = stop
-    return jax.tree.unflatten(treedef, rows)
+        part = values[..., start : start + jnp.size(leaf)]
+        found.append(part.reshape(*values.shape[:-1], *jnp.shape(leaf)))
+        start += jnp.size(leaf)
+    return jax.tree.unflatten(treedef, found)
 
 
 def as_arrays(state: Any, dtype: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(x, dtype=dtype), state)
+
+
+def _split(begun: Begun) -> tuple[Any, Any]:
+    """The numbers that move, and what does not, as numbers of the labels."""
+    moving, rest = eqx.partition(begun, eqx.is_inexact_array)
+    return moving, jax.tree.map(lambda x: x.astype(jnp.int32), rest)
+
+
+def empty_path(begun: Begun, rows: int) -> Path:
+    sizes = [sum(leaf.size for leaf in jax.tree.leaves(part)) for part in _split(begun)]
+    numbers = jnp.zeros((rows, 3 + sizes[0]), begun.time.dtype)
+    return Path(numbers, jnp.full((rows, 4 + sizes[1]), -1, jnp.int32))
+
+
+def _path_row(contact: Any, kind: Any, flags: Flags, n_impacts: Any, sizes: Any, begun: Begun) -> tuple[Any, Any]:
+    moving, rest = (jax.tree.leaves(part) for part in _split(begun))
+    numbers = jnp.concatenate([sizes, *[jnp.ravel(x) for x in moving]])
+    labels = jnp.stack([contact, kind, flags.packed(), n_impacts])
+    return frozen(numbers), jnp.concatenate([labels, *[jnp.ravel(x) for x in rest]])
+
+
+class Known(NamedTuple):
+    """What is known of one arc, or of all arcs of a path with an axis in front."""
+
+    size: Any
+    s: Any
+    ahead: Any
+    contact: Any
+    kind: Any
+    flags: Flags
+    n_impacts: Any
+    begun: Begun
+
+
+def arcs_of(path: Path, like: Begun) -> Known:
+    """A path, read; `like` has the structure of what its arcs begin with."""
+    moving, rest = _split(like)
+    moving, rest = columns(path.numbers[:, 3:], moving), columns(path.labels[:, 4:], rest)
+    begun = eqx.combine(moving, rest)
+    begun = jax.tree.map(lambda x, old: x.astype(old.dtype), begun, like)
+    contact, kind, bits, n_impacts = (path.labels[:, k] for k in range(4))
+    return Known(*[path.numbers[:, k] for k in range(3)], contact, kind, Flags.unpacked(bits), n_impacts, begun)
 
 
 def _empty_log(state: Any, like: Any, rows: int) -> Log:
@@ -161,7 +232,7 @@ def start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> Carry
         n_turns=zero,
         n_at_once=zero,
         log=_empty_log(state, t0, log_rows),
-        path=Path(jnp.zeros((path_rows, 2), t0.dtype), jnp.full((path_rows, 2), -1, jnp.int32)),
+        path=empty_path(Begun(t0, state, memory, t0), path_rows),
         done=~admissible,
         result=RESULTS.where(admissible, RESULTS.reached_t1, RESULTS.invalid_state),
     )
@@ -176,8 +247,8 @@ def turn(
     size = where(active, motion.size(c.control, left), 1.0)  # finished lanes compute harmless numbers
     last = size >= left
     length = where(last, left, frozen(size))
-    begun = system.prepared(c.time, c.state)
-    piece = motion.piece(system, c.time, begun, c.memory, c.jumped, length)
+    ready = system.prepared(c.time, c.state)
+    piece = motion.piece(system, c.time, ready, c.memory, c.jumped, length)
     arc = piece.arc
     kept, control = motion.judge(c.control, size, piece.trial)
     found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
@@ -188,13 +259,13 @@ def turn(
     contact = Choice(found.contact, system.n_contacts)
     s = where(through, arc.length, found.s)
     if differentiable and system.n_contacts > 0:
-        s = where(crossed, corrected(system, arc, s, contact), s)
+        s = where(crossed, crossing_time(s, found.contact, system, arc), s)
     (s,) = shared([s])
     elapsed = s * arc.unit
     reached = through & last
     time, ahead = later(c.time, c.ahead, elapsed)
     time = where(reached, t1, time)
-    arrived = as_arrays(system.advanced(time, begun, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
+    arrived = as_arrays(system.advanced(time, ready, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
     arrived = computed_once(arrived)
 
     since, speed = c.since + elapsed, norm(frozen(arc.tangent(s)))
@@ -214,9 +285,13 @@ def turn(
     until, settled = time + met.pause, struck & met.is_at_rest
     row, labels = Row(time, until, since, arrived, after), jnp.stack([name, _code(met.kind), system.phase(after)])
     log = _written(c.log, c.n_impacts, struck, pack_row(row), labels)
-    sizes = frozen(jnp.stack([where(last, jnp.inf, length), s]))
-    place = c.n_arcs % max(c.path.labels.shape[0], 1)
-    path = _written(c.path, place, ended, sizes, jnp.stack([found.contact, labels[1]]))
+    path = c.path
+    if path.labels.shape[0] > 0:
+        flags = Flags(c.jumped, struck, reached)
+        sizes = jnp.stack([where(last, jnp.inf, length), s, c.ahead])
+        begun = Begun(c.time, c.state, c.memory, c.since)
+        filled = _path_row(found.contact, labels[1], flags, c.n_impacts, sizes, begun)
+        path = _written(path, c.n_arcs % path.labels.shape[0], ended, *filled)
 
     broken = ended & ~jnp.isfinite(total([time, *jax.tree.leaves(jax.tree.map(jnp.sum, arrived))]))
     (broken,) = _shared_flags((broken,))
@@ -374,7 +449,7 @@ def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind
     return _outcome(end)
 
 
-class Begun(NamedTuple):
+class Paused(NamedTuple):
     """How far hops have come, beside the outcome."""
 
     unfinished: Any
@@ -382,21 +457,21 @@ class Begun(NamedTuple):
     mark: Any
 
 
-def begin_by_hops(system, motion, state, t0, t1, *, max_impacts: int) -> tuple[Outcome, Begun]:
+def begin_by_hops(system, motion, state, t0, t1, *, max_impacts: int) -> tuple[Outcome, Paused]:
     """`find`, as far as it goes by hops. Neither this nor the rest is for derivatives."""
     carry = start(system, motion, state, t0, t1, 0, 0)
     end = _hops(carry, system, t1, max_impacts)
     c = _landed(carry, end, system, t1)
-    return _outcome(c), Begun(~c.done, end.ahead, end.mark)
+    return _outcome(c), Paused(~c.done, end.ahead, end.mark)
 
 
-def finish(outcome: Outcome, begun: Begun, system, motion, t1, *, max_impacts: int) -> Outcome:
+def finish(outcome: Outcome, paused: Paused, system, motion, t1, *, max_impacts: int) -> Outcome:
     """The rest, by turns, and, where hops are a short program, by both. The carry, which is long, is made again."""
     hopper = system.hopper(outcome.state)
     next_of = _turned if hopper is not None and hopper.again is not None else turn
     carry = start(system, motion, outcome.state, outcome.time, t1, 0, 0)
     nothing = jnp.zeros((0,), jnp.int16)
-    end = _Hopping(outcome.time, begun.ahead, outcome.state, begun.mark, outcome.n_impacts, nothing)
+    end = _Hopping(outcome.time, paused.ahead, outcome.state, paused.mark, outcome.n_impacts, nothing)
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
     next_turn = lambda c: next_of(c, system, motion, t1, max_impacts)  # noqa: E731
     return _outcome(lax.while_loop(going, next_turn, _landed(carry, end, system, t1)))
