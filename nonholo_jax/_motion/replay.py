@@ -58,8 +58,8 @@ _HOP_TILE = 512
 _STRAGGLERS = 64  # lanes that make their turns together
 
 
-def _arc(system: AbstractSystem, motion: AbstractMotion, t1: Any, known: Known, begun: Begun, log: bool) -> tuple:
-    """One arc of a path, differentiable: what the next one begins with, and the row of the log."""
+def _arc(system: AbstractSystem, motion: AbstractMotion, t1: Any, known: Known, begun: Begun) -> tuple[Begun, Row]:
+    """One arc of a path, differentiable: what the next one begins with, and its row of the log."""
     left, flags = t1 - begun.time + known.ahead, known.flags
     start = system.prepared(begun.time, begun.state)
     size = where(jnp.isinf(known.size), left, known.size)
@@ -79,8 +79,8 @@ def _arc(system: AbstractSystem, motion: AbstractMotion, t1: Any, known: Known, 
         other, pause = system.after(contact, time, arrived, kind_of(known.kind))
         after = keep(flags.struck, as_arrays(other, t1.dtype), arrived)
         until = where(flags.struck, time + pause, time)
-    record = pack_row(Row(time, until, since, arrived, after)) if log else jnp.zeros((0,), t1.dtype)
-    return Begun(until, after, piece.memory, where(flags.struck, 0.0, since)), record
+    row = Row(time, until, since, arrived, after)
+    return Begun(until, after, piece.memory, where(flags.struck, 0.0, since)), row
 
 
 def _resumed(system, motion, t1, carry: Carry, stop: Any, max_impacts: int) -> Carry:
@@ -168,7 +168,8 @@ def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion, values: 
     def step(arguments: Any, row: Known, moving: Any) -> tuple:
         system, motion, _, _, t1 = arguments
         begun = eqx.combine(moving, eqx.filter(row.begun, eqx.is_inexact_array, inverse=True))
-        after, record = _arc(system, motion, t1, row, begun, log_rows > 0)
+        after, logged = _arc(system, motion, t1, row, begun)
+        record = pack_row(logged) if log_rows else jnp.zeros(values.shape[1:], values.dtype)
         return eqx.filter(after, eqx.is_inexact_array), record
 
     return Iteration(
