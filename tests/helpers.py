@@ -28,8 +28,8 @@ from nonholo_jax import (
     Smooth,
     Sphere,
 )
-from nonholo_jax._math.types import result_name
 from nonholo_jax._math import Choice
+from nonholo_jax._math.types import result_name
 
 # Compiled for derivatives by the dozen, each run once: without the slow passes of the compiler.
 fast_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})

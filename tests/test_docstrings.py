@@ -21,7 +21,8 @@ def blocks_of(text):
 def examples():
     """(name, code) of every block in the docstrings of public names and their public methods, and in the README."""
     found = []
-    for name, thing in sorted(vars(nonholo_jax).items()):
+    for name in dir(nonholo_jax):
+        thing = getattr(nonholo_jax, name)
         if name.startswith("_") or inspect.ismodule(thing):
             continue
         things = [(name, thing)]

@@ -129,6 +129,7 @@ def test_configuration_is_left_to_the_command_line(file):
 
 
 def test_everything_public_is_documented():
-    for name, thing in vars(nonholo_jax).items():
+    for name in dir(nonholo_jax):
+        thing = getattr(nonholo_jax, name)
         if not name.startswith("_") and getattr(thing, "__module__", "").startswith("nonholo_jax"):
             assert thing.__doc__, name

@@ -26,6 +26,7 @@ from .tiles import (
 from .types import (
     KINDS as KINDS,
     NAMES_OF_RESULTS as NAMES_OF_RESULTS,
+    NO_FAILURES as NO_FAILURES,
     NO_IMPACTS as NO_IMPACTS,
     RESULTS as RESULTS,
     Index as Index,

@@ -15,10 +15,10 @@ from jax.custom_batching import custom_vmap
 from jax.sharding import Mesh, PartitionSpec
 
 
-def in_tiles(function: Callable, size: int) -> Callable:
-    """The same function of pytrees, which under `vmap` on a CPU runs `size` lanes at a time. Not differentiable in
-    reverse mode."""
-    return _in_a_batch(lambda whole, lanes, n: by_tiles(whole, lanes, n, size), function, function)
+def in_tiles(function: Callable, size: int, alone: Callable | None = None) -> Callable:
+    """The same function of pytrees, which under `vmap` on a CPU runs `size` lanes at a time; `alone` is another way to
+    compute it for one lane. Not differentiable in reverse mode."""
+    return _in_a_batch(lambda whole, lanes, n: by_tiles(whole, lanes, n, size), alone or function, function)
 
 
 def unless_batched(alone: Callable, function: Callable) -> Callable:

@@ -65,6 +65,9 @@ NO_IMPACTS = ("left", "gripped")
 NAMES_OF_RESULTS = tuple(RESULTS._name_to_item)
 
 
+NO_FAILURES = [NAMES_OF_RESULTS.index(name) for name in ("reached_t1", "at_rest", "max_impacts")]  # their codes
+
+
 def is_success(result: RESULTS):
     """True where the motion did all that was asked of it. Shape as `result`."""
     return (result == RESULTS.reached_t1) | (result == RESULTS.at_rest)

@@ -207,16 +207,13 @@ def search(system: AbstractSystem, arc: Arc, start: Any, window: Any, touching: 
         hit = first.hit & (end <= arc.length)
         ahead = where(first.clear, 4.0, 2.0) * jnp.minimum(first.size, arc.length)
         rate = first.rate + first.bend * where(hit, first.size, 0.0)
-        level = [jnp.asarray(x, s.dtype) for x in (rate, first.bend, first.noise)]
-        found = Search(
-            jnp.minimum(end, arc.length), ahead, where(hit, contact, none), hit | (end >= arc.length), *level,
-            jnp.asarray(first.exact),
-        )  # fmt: skip
+        rate, bend, noise = (jnp.asarray(x, s.dtype) for x in (rate, first.bend, first.noise))
+        s, finished = jnp.minimum(end, arc.length), hit | (end >= arc.length)
+        found = Search(s, ahead, where(hit, contact, none), finished, rate, bend, noise, jnp.asarray(first.exact))
         return Search(*[where(state.finished, a, b) for a, b in zip(state, found, strict=True)])
 
-    nothing = [jnp.zeros_like(start)] * 3
-    none = jnp.asarray(-1, dtype=jnp.int32)
-    state = Search(start, window, none, start >= arc.length, *nothing, jnp.asarray(False))
+    none, zero = jnp.asarray(-1, dtype=jnp.int32), jnp.zeros_like(start)
+    state = Search(start, window, none, start >= arc.length, zero, zero, zero, jnp.asarray(False))
     if n_steps == 1 or system.n_contacts == 0:
         return step(state)
     going = lambda c: (c[0] < n_steps) & eqxi.unvmap_any(~c[1].finished)  # noqa: E731

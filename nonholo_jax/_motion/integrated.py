@@ -1,5 +1,7 @@
 """Motion by any explicit Diffrax solver, one step an arc, with the solver's own interpolant."""
 
+import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -38,6 +40,8 @@ class Integrated(AbstractMotion):
     - `dt0`: first step in s, or `None` to have it chosen.
     - `max_steps`: bound on the number of accepted steps (arcs, each cut short by an impact included), after which the
         result is `step_limit`.
+    - `unroll`: speed only. Whether the stages of a step are written out one after the other, over scalars, which is
+        quicker in batches and takes longer to compile; `None` does so in batches of balls.
     - `safe_steps`, `tile`: speed only. How often one turn of the event loop may look ahead for a crossing, and how many
         lanes of a batch share one loop on a CPU.
 
@@ -58,6 +62,7 @@ class Integrated(AbstractMotion):
     max_steps: int = eqx.field(static=True, default=4096)
     safe_steps: int = eqx.field(static=True, default=3)
     tile: int = eqx.field(static=True, default=64)
+    unroll: bool | None = eqx.field(static=True, default=None)
     is_closed_form: ClassVar[bool] = False
 
     def __check_init__(self):
@@ -91,6 +96,11 @@ class Integrated(AbstractMotion):
             return diffrax.PIDController(rtol=self.rtol, atol=self.atol, norm=rms)
         return self.stepsize_controller
 
+    def in_batch(self, system):
+        if self.unroll is not None or system.is_long:
+            return self
+        return dataclasses.replace(self, unroll=True)
+
     def check(self, system):
         del system
 
@@ -122,7 +132,7 @@ class Integrated(AbstractMotion):
 
     def piece(self, system, time, state, memory, jumped, size):
         if isinstance(self.solver, diffrax.AbstractERK):
-            return _runge_kutta_step(self.solver, system, time, state, size)
+            return _runge_kutta_step(self.solver, system, time, state, size, not self.unroll)
         z0 = _arrays(system.evolving(state), time)
         z1, error, info, memory, _ = self.solver.step(_term(system, state), time, time + size, z0, None, memory, jumped)
         path = self.solver.interpolation_cls(t0=time, t1=time + size, **info)
@@ -202,11 +212,11 @@ def _joined(x: Any, like: Any) -> Any:
     return jnp.stack([jnp.asarray(c, dtype=like.dtype) for c in x])
 
 
-def _runge_kutta_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -> Piece:
+def _runge_kutta_step(solver: Any, system: Any, time: Any, state: Any, h: Any, is_compact: bool) -> Piece:
     """One step of an explicit Runge-Kutta method and its interpolant."""
     tableau, (q, v) = solver.tableau, system.evolving(state)
     make, split = _unrolled_stages, tuple
-    if system.is_long:  # the same arithmetic on two arrays instead of many scalars
+    if is_compact:  # the same arithmetic on two arrays instead of many scalars
         make, split = _stages_in_turn, lambda blocks: tuple(c for block in blocks for c in block)
         q, v = (_joined(q, time),), (_joined(v, time),)
     n, z0 = len(q), (*q, *v)
@@ -219,7 +229,7 @@ def _runge_kutta_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -
     if len(weights) == 2 and not tableau.fsal:
         means = [_combination(tableau.b_sol, column) for column in zip(*rates, strict=True)]
         ends, _ = system.derivative(time + h, state, split(z1[:n]), split(z1[n:]))
-        ends = (_joined(ends, time),) if system.is_long else ends
+        ends = (_joined(ends, time),) if is_compact else ends
         path = tuple(_cubic(*each, h) for each in zip(q, rates[0], ends, means, strict=True))
         rate = tuple(_quadratic(*each) for each in zip(v, stages[0][n:], z1[n:], strict=True))
     else:
@@ -229,7 +239,7 @@ def _runge_kutta_step(solver: Any, system: Any, time: Any, state: Any, h: Any) -
             # The last coefficient makes the polynomial end where the step ends, to rounding.
             polynomials.append((x, *inner, plus(step, times(-1.0, total(inner)))))
         path, rate = tuple(polynomials[:n]), tuple(polynomials[n:])
-    if system.is_long:
+    if is_compact:
         path, rate = (tuple(zip(*part[0], strict=True)) for part in (path, rate))
     return Piece(Arc(time, state, path, rate, jnp.ones_like(h), h), None, (split(z0), split(z1), split(error)))
 
@@ -249,33 +259,41 @@ def _quadratic(v0: Any, step: Any, v1: Any) -> tuple:
     return v0, step, plus(v1, times(-1.0, plus(v0, step)))
 
 
+@functools.lru_cache(maxsize=32)
+def _weights(interpolation: Any, b_sol: tuple, dtype: Any) -> np.ndarray:
+    """`interpolation_weights` of an interpolation class and the weights of the solution."""
+    n = len(b_sol)
+    nodes = [0.5 - 0.5 * np.cos(np.pi * (np.arange(degree) + 1) / degree) for degree in range(1, _HIGHEST + 1)]
+    points = [*nodes, np.linspace(0.0, 1.0, 23)]  # 0 is known: the path starts there
+    with jax.ensure_compile_time_eval():
+        ends = {"t0": jnp.zeros((), dtype), "t1": jnp.ones((), dtype), "y0": jnp.zeros(n, dtype)}
+        path = interpolation(**ends, y1=jnp.asarray(b_sol, dtype), k=jnp.eye(n, dtype=dtype))
+        found = jax.jit(jax.vmap(path.evaluate))(jnp.asarray(np.concatenate(points), dtype))  # one program for all
+    *samples, values = np.split(np.asarray(found, dtype=float), np.cumsum([len(x) for x in points])[:-1])
+    eps = float(jnp.finfo(dtype).eps)
+    for degree, (at, sample) in enumerate(zip(nodes, samples, strict=True), 1):
+        powers = np.arange(1, degree + 1)
+        fit = np.linalg.solve(at[:, None] ** powers, sample)
+        if np.max(np.abs(points[-1][:, None] ** powers @ fit - values)) < 1e4 * eps * max(1.0, np.max(np.abs(fit))):
+            fit[np.abs(fit) < 1e2 * eps] = 0.0
+            return fit[:-1]
+    return np.zeros(0)
+
+
+_HIGHEST = 9  # degree of an interpolant
+
+
 def interpolation_weights(solver: Any) -> np.ndarray:
     """The solver's interpolant as powers of theta in [0, 1]: row j - 1 holds the weights of theta^j on the stages, for
     j from 1 to degree - 1; what theta^degree gets follows from the end of the step. Constants, found at trace time by
     evaluating Diffrax's own interpolation class on unit stages and fitting the lowest degree that reproduces it."""
-    tableau = solver.tableau
-    n = tableau.num_stages
-    with jax.ensure_compile_time_eval():
-        path = solver.interpolation_cls(
-            t0=jnp.asarray(0.0),
-            t1=jnp.asarray(1.0),
-            y0=jnp.zeros(n),
-            y1=jnp.asarray(tableau.b_sol),
-            k=jnp.eye(n),
+    b_sol = tuple(float(weight) for weight in solver.tableau.b_sol)
+    weights = _weights(solver.interpolation_cls, b_sol, jnp.zeros(()).dtype)
+    if weights.ndim == 1:
+        raise ValueError(
+            f"Argument `solver` must have a polynomial interpolant, but got {solver}; try diffrax.Tsit5()."
         )
-        check = np.linspace(0.0, 1.0, 23)
-        values = {float(s): np.asarray(path.evaluate(jnp.asarray(s)), dtype=float) for s in check}
-        eps = float(jnp.finfo(jnp.zeros(()).dtype).eps)
-        for degree in range(1, 10):
-            nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(degree) + 1) / degree)  # 0 is known: the path starts there
-            samples = np.stack([np.asarray(path.evaluate(jnp.asarray(s)), dtype=float) for s in nodes])
-            fit = np.linalg.solve(nodes[:, None] ** np.arange(1, degree + 1), samples)
-            powers = lambda s, d=degree: s ** np.arange(1, d + 1)  # noqa: E731
-            misfit = max(np.max(np.abs(powers(s) @ fit - value)) for s, value in values.items())
-            if misfit < 1e4 * eps * max(1.0, float(np.max(np.abs(fit)))):
-                fit[np.abs(fit) < 1e2 * eps] = 0.0
-                return fit[:-1]
-    raise ValueError(f"Argument `solver` must have a polynomial interpolant, but got {solver}; try diffrax.Tsit5().")
+    return weights
 
 
 def _fitted_arc(path: Any, z0: Any, time: Any, state: Any, h: Any) -> Arc:

@@ -172,7 +172,8 @@ def arcs_of(path: Path, like: Begun) -> Known:
     begun = eqx.combine(moving, rest)
     begun = jax.tree.map(lambda x, old: x.astype(old.dtype), begun, like)
     contact, kind, bits, n_impacts = (path.labels[:, k] for k in range(4))
-    return Known(*[path.numbers[:, k] for k in range(3)], contact, kind, Flags.unpacked(bits), n_impacts, begun)
+    size, s, ahead = (path.numbers[:, k] for k in range(3))
+    return Known(size, s, ahead, contact, kind, Flags.unpacked(bits), n_impacts, begun)
 
 
 def _empty_log(state: Any, like: Any, rows: int) -> Log:

@@ -29,6 +29,11 @@ class AbstractMotion(eqx.Module):
     tile: eqx.AbstractVar[int]
     is_closed_form: eqx.AbstractClassVar[bool]
 
+    def in_batch(self, system: AbstractSystem) -> "AbstractMotion":
+        """The same motion in the form that is quicker in a batch, however long its program is."""
+        del system
+        return self
+
     @abstractmethod
     def check(self, system: AbstractSystem) -> None:
         """Raise `ValueError` if this motion cannot run the system."""

@@ -124,8 +124,9 @@ def _hop_again(begun: Begun, choices: Any, hop: Callable, t1: Any) -> Begun:
     return begun._replace(time=time, state=state)
 
 
-def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion, values: Any) -> Iteration:
+def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion, values: Any, in_batch: bool) -> Iteration:
     """The motion with derivatives: a part of the path is found without them, and its arcs are repeated with them."""
+    of_motion = lambda system, motion: motion.in_batch(system) if in_batch else motion  # noqa: E731
     pieces = motion.max_pieces(max_impacts)
     most = -(-pieces // _ROWS)
     rows = -(-pieces // most)
@@ -139,7 +140,7 @@ def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion, values: 
 
     def begin(arguments: Any) -> tuple:
         still = frozen(arguments)
-        found = start(*still, 0, 0)
+        found = start(still[0], still[1], still[2], still[3], still[4], 0, 0)
         moves = ~found.done
         system, motion, state, t0, t1 = harmless(arguments, moves)
         again = Begun(t0, state, motion.begin(system, t0, state, t1)[1], jnp.zeros_like(t0))
@@ -159,6 +160,7 @@ def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion, values: 
     def look(arguments: Any, i: Any, stays: Any) -> tuple:
         moves, done, found = stays
         still, way, _, _, end = frozen(arguments)
+        way = of_motion(still, way)
         begun = Begun(found.time, found.state, found.memory, found.since)
         path = found._replace(path=empty_path(begun, rows))
         search = frozen(_resumed(still, way, end, path, rows * (i + 1), max_impacts))
@@ -168,7 +170,7 @@ def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion, values: 
     def step(arguments: Any, row: Known, moving: Any) -> tuple:
         system, motion, _, _, t1 = arguments
         begun = eqx.combine(moving, eqx.filter(row.begun, eqx.is_inexact_array, inverse=True))
-        after, logged = _arc(system, motion, t1, row, begun)
+        after, logged = _arc(system, of_motion(system, motion), t1, row, begun)
         record = pack_row(logged) if log_rows else jnp.zeros(values.shape[1:], values.dtype)
         return eqx.filter(after, eqx.is_inexact_array), record
 
@@ -193,7 +195,11 @@ def _find(system, motion, state, t0, t1, **options):
     hopper = hopper_of(system, motion, state, options["max_impacts"])
     if options["log_rows"] == 0 and hopper is not None:
         return _find_by_hops(*primals, alone="lax" if hopper.again is None else "hop", **options)
-    return in_tiles(lambda *primals: find(*primals, **options), motion.tile)(*primals)
+
+    def many(system, motion, *rest):
+        return find(system, motion.in_batch(system), *rest, **options)
+
+    return in_tiles(many, motion.tile, alone=lambda *primals: find(*primals, **options))(*primals)
 
 
 def _find_by_hops(system, motion, state, t0, t1, *, alone: str, max_impacts: int, log_rows: int):
@@ -236,8 +242,8 @@ def _find_or_replay_jvp(primals, tangents, *, max_impacts: int, log_rows: int):
     out = _find_or_replay(*primals, max_impacts=max_impacts, log_rows=log_rows)
     still = frozen(out)
     like = (still.time, still.state, still.log.values)
-    iteration = _iteration(max_impacts, log_rows, primals[1], still.log.values)
-    time, state, values = tangent_of(iteration, primals, tangents, still.n_arcs, like, primals[1].tile)
+    alone, many = (_iteration(max_impacts, log_rows, primals[1], still.log.values, each) for each in (False, True))
+    time, state, values = tangent_of(alone, many, primals, tangents, still.n_arcs, like, primals[1].tile)
     values = jnp.where(jnp.isnan(still.log.values), 0.0, values)
     nothing = jax.tree.map(lambda _: None, out)
     return out, nothing._replace(time=time, state=state, log=Log(values, None))

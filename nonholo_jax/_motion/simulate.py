@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._math import (
+    NO_FAILURES,
     as_number,
     as_pair,
     as_quaternion,
@@ -283,18 +284,19 @@ def _raised(trajectory: Trajectory) -> Trajectory:
     code = trajectory.result._value  # pyright: ignore[reportAttributeAccessIssue]
     if type(code).__name__ == "BatchTracer":  # JAX has no public name for it; inside vmap nothing is raised
         return trajectory
-    failed = is_failure(trajectory.result)
     if isinstance(code, jax.core.Tracer):
+        failed = is_failure(trajectory.result)
         # On every array of the answer: what is not used is compiled away, and its error with it.
         answer, rest = eqx.partition((trajectory.final, trajectory.t1, trajectory.impacts), eqx.is_array)
         final, t1, impacts = eqx.combine(trajectory.result.error_if(answer, failed), rest)
         return dataclasses.replace(trajectory, final=final, t1=t1, impacts=impacts)
+    failed = ~np.isin(np.asarray(code), NO_FAILURES)  # without a program of its own
     if failed.ndim == 0 and bool(failed):
         result = trajectory.result
         when = "" if isinstance(trajectory.t1, jax.core.Tracer) else f" (t = {float(trajectory.t1):g} s)"
         raise SimulationError(f"{result_name(result)}: {result_message(result)}{when}")
     if failed.ndim and bool(failed.any()):
-        first = int(jnp.argmax(failed))
+        first = int(np.argmax(failed))
         result = jax.tree.map(lambda x: x[first], trajectory.result)
         raise SimulationError(
             f"{int(failed.sum())} of {failed.size} lanes failed, the first of them lane {first} with "

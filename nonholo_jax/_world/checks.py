@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 
 from .._impact import divisor, matmul, pseudo_inverse, whiten
 from .._math import components
-from .system import rounding
+from .system import magnitude, rounding
 
 
 def refuse_shapes(system: Any, q: Array, v: Array) -> None:
@@ -112,7 +112,7 @@ def conditions(system: Any, t: Array, q: Array, v: Array) -> dict[Any, tuple[Boo
         found |= _frame_conditions(system, q)
     for i, barrier in enumerate(system.barriers):
         gap = barrier.gap(q)
-        found[("apart", i)] = (gap >= -16.0 * rounding(system, i, components(q)), gap)
+        found[("apart", i)] = (gap >= -16.0 * rounding(system, i, magnitude(components(q)), q.dtype), gap)
         e, curvature = barrier.restitution, barrier.curvature
         found[("restitution", i)] = (jnp.asarray((e >= 0) & (e <= 1)), jnp.asarray(e, q.dtype))
         if curvature is not None:

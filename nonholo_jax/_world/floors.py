@@ -37,7 +37,7 @@ class Floors:
 
     def face(self, contact: Choice, x: Vector3, time: Any) -> tuple[Face, Any]:
         """The face below a ball on that surface, and whether it has edges."""
-        faces = [surface.face(x, time) for surface in self._surfaces]
+        faces: list[Any] = [surface.face(x, time) for surface in self._surfaces]
         half = [(1.0, 1.0) if face.half is None else face.half for face in faces]
         vector = lambda options: contact.vector(options, self.indices)  # noqa: E731
         below = contact.of([jnp.asarray(face.below) for face in faces], self.indices)

@@ -40,6 +40,16 @@ from .surface import Face
 from .system import AbstractSystem, Meeting, bounces, magnitude, rounding
 
 
+class Freedom(NamedTuple):
+    """What a support leaves of a ball's motion: with the acceleration a and the normal n, share (a - held (n . a) n);
+    the spin at the velocity v is spin + turning (n x v)."""
+
+    held: Any  # 1 on a face, else 0
+    share: Any  # 1 / (1 + alpha) for a ball that rolls, else 1
+    spin: Vector3
+    turning: Any
+
+
 class Ground(NamedTuple):
     """What a ball that stays on a face has below it."""
 
@@ -47,6 +57,7 @@ class Ground(NamedTuple):
     edged: Any  # whether it is on a face with edges
     rolls: Any  # whether it is on a face on which it rolls, perhaps after sliding
     friction: Number | None  # of that face; infinite where it never slides or never rolls
+    free: Freedom
     slip: Vector3  # zero of a ball that rolls, and where there is no friction to slide against
     heading: Vector3  # the direction in which it slides against friction, or zero
     straight: Any  # whether it keeps that direction until its slip ends
@@ -143,10 +154,13 @@ class Grounded(AbstractSystem):
         flight, floors, on = state.flight, self._floors, state.support >= 0
         support = Choice(self.phase(state), self._n_surfaces)
         face, edged = floors.face(support, flight.position, time)
-        edged, rolls = on & edged, on & floors.rolls(support)
+        edged, rolls, ball, n = on & edged, on & floors.rolls(support), self.scene.ball, face.normal
+        share = where(rolls, ratio(1.0, 1.0 + ball.inertia_ratio), 1.0)
+        pivot = where_vector(rolls, scale(dot(n, flight.spin), n), flight.spin)
+        free = Freedom(where(on, 1.0, 0.0), share, pivot, where(rolls, ratio(1.0, ball.radius), 0.0))
         if not floors.have_friction:
-            return Ground(face, edged, rolls, None, rolling.NONE, rolling.NONE, True)
-        ball, n, friction = self.scene.ball, face.normal, floors.friction(support)
+            return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True)
+        friction = floors.friction(support)
         slides = rolls & jnp.isfinite(friction)
         slip = rolling.own_slip(ball.radius, n, flight.velocity, flight.spin)
         slip = where_vector(slides, slip, rolling.NONE)
@@ -155,23 +169,23 @@ class Grounded(AbstractSystem):
         along = rolling.along_surface(n, a)
         heading = where_vector(slides, rolling.heading(slip, along, most), rolling.NONE)
         straight = self.parabolic or rolling.stays_straight(heading, slip, along, most, self.tolerance)
-        return Ground(face, edged, rolls, friction, slip, heading, straight)
+        return Ground(face, edged, rolls, friction, free, slip, heading, straight)
 
     def derivative(self, time, state, q, v):
-        flight, on, ball = state.flight, state.support >= 0, self.scene.ball
-        below = self._below(time, state)
-        n, (q, slip) = below.face.normal, (q[:3], q[3:])
-        if self.scene.air is not None:
+        flight, below = state.flight, self._below(time, state)
+        n, free, (q, slip) = below.face.normal, below.free, (q[:3], q[3:])
+        if self.scene.air is not None:  # a ball that rolls turns as it goes
             turning = subtract(v, slip) if slip else v
-            spin = rolling.rolling_spin(ball.radius, n, turning, flight.spin)
-            flight = flight._replace(spin=where_vector(below.rolls, spin, flight.spin))
+            flight = flight._replace(spin=add(free.spin, scale(free.turning, cross(n, turning))))
         _, a = self.scene.derivative(time, flight, q, v)
-        along, alpha = rolling.along_surface(n, a), ball.inertia_ratio
-        changes = self._slip_rate(below, slip, along, dot(a, n)) if slip else ()
+        push = dot(n, a)
+        rate = subtract(a, scale(free.held * push, n))
+        if not slip:
+            return v, scale(free.share, rate)
+        changes = self._slip_rate(below, slip, rate, push)
         # Friction leaves v + alpha r (omega x n) alone, so that (1 + alpha) v - alpha u changes by gravity only.
-        rolling_rate = add(along, scale(alpha, changes)) if slip else along
-        rate = where_vector(below.rolls, scale(1.0 / (1.0 + alpha), rolling_rate), along)
-        return (*v, *changes), where_vector(on, rate, a)
+        with_slip = scale(free.share, add(rate, scale(self.scene.ball.inertia_ratio, changes)))
+        return (*v, *changes), where_vector(below.rolls, with_slip, scale(free.share, rate))
 
     def _slip_rate(self, below: Ground, slip: Vector3, along: Vector3, push: Number) -> Vector3:
         """The rate of the slip, zero for a ball that does not slide against friction."""
@@ -187,16 +201,14 @@ class Grounded(AbstractSystem):
 
     def advanced(self, time, state, q, v, duration):
         flight = self.scene.advanced(time, state.flight, q[:3], v, duration)
-        below, radius = self._below(time, state), self.scene.ball.radius
-        slips = (below.slip, q[3:] if self._floors.have_friction else rolling.NONE)
-        turning = [subtract(u, slip) for u, slip in zip((state.flight.velocity, v), slips, strict=True)]
-        after = rolling.rolling_spin(radius, below.face.normal, turning[1], flight.spin)
-        orientation = flight.orientation
+        below = self._below(time, state)
+        n, free, orientation = below.face.normal, below.free, flight.orientation
+        spin = add(free.spin, scale(free.turning, cross(n, subtract(v, q[3:]) if q[3:] else v)))
         if orientation is not None:
-            before = rolling.rolling_spin(radius, below.face.normal, turning[0], flight.spin)
-            turned = rolled(state.flight.orientation, before, after, duration, orientation.dtype)
+            turning = subtract(state.flight.velocity, below.slip)
+            before = add(free.spin, scale(free.turning, cross(n, turning)))
+            turned = rolled(state.flight.orientation, before, spin, duration, orientation.dtype)
             orientation = jnp.where(below.rolls, turned, orientation)
-        spin = where_vector(below.rolls, after, flight.spin)
         return Travel(flight._replace(spin=spin, orientation=orientation), state.support)
 
     # Contacts

@@ -9,52 +9,81 @@ import pytest
 from nonholo_jax._math.tangents import Iteration, tangent_of
 
 MOST = 20
+PARTS = {1: 20, 5: 4, 20: 1}  # how many parts, of how many steps
 
 
 def begin(arguments):
+    x, shared, count = arguments
+    return {"odd": jnp.asarray(False), "x": x + shared}, {"x": x + shared, "sum": jnp.zeros_like(x)}
+
+
+def step(arguments, row, moving):
+    """The path, sin(i), is known; so is x at the beginning, but not its derivative."""
     x, shared, _ = arguments
-    return {"odd": jnp.asarray(False)}, {"x": x + shared, "sum": jnp.zeros_like(x)}
-
-
-def step(arguments, i, stays, moving):
-    x, shared, count = arguments
+    i, path = row["i"], row["path"]
     old = moving["x"]
-    new = shared * jnp.sin(old) + jnp.asarray(i).astype(x.dtype) * x
-    going = i < count
-    moved = {"x": jnp.where(going, new, old), "sum": moving["sum"] + jnp.where(going, new * old, 0.0)}
-    return {"odd": stays["odd"] ^ going}, moved
+    new = shared * jnp.sin(old) + i.astype(x.dtype) * x
+    moved = {"x": new, "sum": moving["sum"] + new * old + path * x}
+    return moved, jnp.stack([new * shared, old])
 
 
-def look(arguments, i, stays):
-    return stays, jnp.sin(jnp.asarray(i).astype(float))
+def look(size):
+    def look(arguments, k, stays):
+        """`size` steps from k * size on, as far as there are so many."""
+        x, shared, count = jax.lax.stop_gradient(arguments)
+        i = size * jnp.asarray(k, dtype=jnp.int32) + jnp.arange(size, dtype=jnp.int32)
+        rows, now, total = [], *stays["moving"]
+        for each in range(size):
+            path = jnp.sin(i[each].astype(x.dtype))
+            rows.append({"i": i[each], "path": path, "x": now, "sum": total})
+            new, _ = step((x, shared, count), rows[-1], {"x": now, "sum": total})
+            going = i[each] < count
+            now, total = jnp.where(going, new["x"], now), jnp.where(going, new["sum"], total)
+        rows = jax.tree.map(lambda *columns: jnp.stack(columns), *rows)
+        return {**stays, "moving": (now, total)}, jnp.clip(count - i[0], 0, size), rows
+
+    return look
 
 
-def follow(arguments, i, stays, path, moving):
-    x, shared, count = arguments
-    stays, moved = step(arguments, i, stays, moving)
-    return stays, {"x": moved["x"], "sum": moved["sum"] + jnp.where(i < count, path * x, 0.0)}
-
-
-def asked(moving):
-    return moving["x"], 2.0 * moving["sum"]
+def asked(moving, table):
+    return moving["x"], 2.0 * moving["sum"], jnp.sum(table[:, 0] + 3.0 * table[:, 1])
 
 
 def plainly(x, shared, count):
-    stays, moving = begin((x, shared, count))
+    _, moving = begin((x, shared, count))
+    table = jnp.zeros((MOST, 2))
     for i in range(MOST):
-        stays, path = look((x, shared, count), i, stays)
-        stays, moving = follow((x, shared, count), i, stays, path, moving)
-    return asked(moving)
+        row = {"i": jnp.asarray(i, dtype=jnp.int32), "path": jnp.sin(jnp.asarray(i, dtype=x.dtype))}
+        new, record = step((x, shared, count), row, moving)
+        moving = jax.tree.map(lambda a, b, i=i: jnp.where(i < count, a, b), new, moving)
+        table = table.at[jnp.where(i < count, i, MOST)].set(record, mode="drop")
+    return asked(moving, table)
 
 
-def iteration(steps, finished=True):
-    """All lanes make the same number of steps, some of them idle."""
+def iteration(steps, parts, finished=True):
+    """All lanes look through the same number of parts, some of them idle."""
+    size = PARTS[parts]
+
+    def starts(arguments):
+        stays, moving = begin(arguments)
+        return {**stays, "moving": jax.lax.stop_gradient((moving["x"], moving["sum"]))}, moving
+
     return Iteration(
-        begin, lambda _, hint: steps + 0 * hint, look, follow, lambda _: jnp.asarray(finished), asked, MOST
+        begin=starts,
+        parts=lambda _, hint: -(-steps // size) + 0 * hint,
+        look=look(size),
+        harmless=lambda arguments, _: arguments,
+        starts=lambda row: {"x": row["x"], "sum": row["sum"]},
+        step=step,
+        place=lambda row: row["i"],
+        table=np.zeros((MOST, 2)),
+        finished=lambda _: jnp.asarray(finished),
+        of=asked,
+        most=parts,
     )
 
 
-def tiled(steps, tile, finished=True):
+def tiled(steps, tile, finished=True, parts=5):
     @jax.custom_jvp
     def run(x, shared, count):
         return plainly(x, shared, count)
@@ -64,7 +93,8 @@ def tiled(steps, tile, finished=True):
         like = run(*primals)
         along = (*tangents[:2], None)
         hint = jnp.asarray(0, dtype=jnp.int32)
-        return like, tangent_of(iteration(steps, finished), primals, along, hint, like, tile)
+        way = iteration(steps, parts, finished)
+        return like, tangent_of(way, way, primals, along, hint, like, tile)
 
     return run
 
@@ -78,18 +108,18 @@ def over_lanes(run, steps):
     """A scalar of all lanes, whose parameter is shared."""
 
     def loss(x, shared, count):
-        a, b = jax.vmap(run, in_axes=(0, None, 0))(x, shared, jnp.minimum(count, steps))
-        return jnp.sum(a * b) + jnp.sum(a)
+        a, b, c = jax.vmap(run, in_axes=(0, None, 0))(x, shared, jnp.minimum(count, steps))
+        return jnp.sum(a * b) + jnp.sum(a) + jnp.sum(b * c)
 
     return loss
 
 
 @pytest.mark.parametrize("steps", [0, 1, 8, 9, 17, 20])
-@pytest.mark.parametrize("tile", [1, 4, 64])
-def test_both_modes_are_those_of_the_plain_program(steps, tile):
+@pytest.mark.parametrize("tile, parts", [(1, 5), (4, 1), (4, 5), (64, 20)])
+def test_both_modes_are_those_of_the_plain_program(steps, tile, parts):
     given = numbers(7)
     truth = jax.grad(over_lanes(plainly, steps), argnums=(0, 1))(*given)
-    own = over_lanes(tiled(steps, tile), steps)
+    own = over_lanes(tiled(steps, tile, parts=parts), steps)
     reverse = jax.jit(jax.grad(own, argnums=(0, 1)))(*given)
     forward = jax.jit(jax.jacfwd(own, argnums=(0, 1)))(*given)
     for one, other, true in zip(reverse, forward, truth, strict=True):
