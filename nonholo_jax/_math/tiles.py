@@ -15,6 +15,12 @@ from jax.custom_batching import custom_vmap
 from jax.sharding import Mesh, PartitionSpec
 
 
+def on_cpu() -> bool:
+    """Whether what is traced now is for a CPU: JAX's default backend, unless `jax.default_device` says otherwise."""
+    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return (getattr(chosen, "platform", chosen) or jax.default_backend()) == "cpu"
+
+
 def in_tiles(function: Callable, size: int, alone: Callable | None = None) -> Callable:
     """The same function of pytrees, which under `vmap` on a CPU runs `size` lanes at a time; `alone` is another way to
     compute it for one lane. Not differentiable in reverse mode."""
@@ -67,7 +73,7 @@ def where_needed(function: Callable, size: int) -> Callable:
             needed, otherwise = jax.tree.map(every, (needed, otherwise), tuple(in_batched[:2]))
             lanes, rest = eqx.partition(arrays, in_batched[2])
             whole = jax.vmap(lambda otherwise, lanes: function(otherwise, *eqx.combine(lanes, rest, constants)))
-            if n <= size or jax.default_backend() != "cpu":
+            if n <= size or not on_cpu():
                 out = jax.tree.map(lambda a, b: jnp.where(along(needed, a), a, b), whole(otherwise, lanes), otherwise)
             else:
                 out = _gathered(whole, needed, otherwise, lanes, n, size)
@@ -99,7 +105,7 @@ def _gathered(whole: Callable, needed: Any, otherwise: Any, lanes: Any, n: int, 
 def by_tiles(whole: Callable, lanes: Any, n: int, size: int) -> Any:
     """`whole` on `n` lanes; on a CPU on tiles of `size` lanes, one after the other, the last filled up with the last
     lane."""
-    if n <= size or jax.default_backend() != "cpu":
+    if n <= size or not on_cpu():
         return whole(lanes)
     n_tiles, padding = -(-n // size), -n % size
     tiles = jax.tree.map(

@@ -120,3 +120,13 @@ def test_devices_share_a_batch():
     done = subprocess.run([sys.executable, "-c", DEVICES], capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["shared", "by", "2", "2"]
+
+
+def test_a_batch_on_a_cpu_is_cut_into_tiles_where_an_accelerator_is_there_too(monkeypatch):
+    loops = lambda: str(jax.make_jaxpr(in_tiles_of_two())(jnp.ones(8))).count("scan[")  # noqa: E731
+    in_tiles_of_two = lambda: jax.vmap(in_tiles(lambda x: 2.0 * x, 2))  # noqa: E731
+    assert loops() == 1
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert loops() == 0
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert loops() == 1
