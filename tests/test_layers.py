@@ -28,7 +28,19 @@ ROOMS = {
         "lagrangian",
     ],
     "_motion": ["crossing", "motion", "integrated", "loop", "replay", "accuracy", "trajectory", "simulate"],
-    "_questions": ["diagnostics", "names", "goal", "chart", "design", "fit", "fifty_digits", "ways", "tradeoff"],
+    "_questions": [
+        "diagnostics",
+        "names",
+        "goal",
+        "chart",
+        "design",
+        "fit",
+        "fifty_digits",
+        "ways",
+        "tradeoff",
+        "rates",
+        "bench",
+    ],
     "_ensembles": [
         "distribution",
         "sampler",
@@ -40,8 +52,8 @@ ROOMS = {
         "sensitivity",
     ],
     "_files": ["schema_types", "montecarlo_schema", "scene_schema", "montecarlo_file", "scene_file"],
-    "_pictures": ["outline", "samples", "ensemble_plot", "fit_plot", "plot", "tradeoff_plot"],
-    "_cli": ["clock", "report", "montecarlo_verb", "main"],
+    "_pictures": ["bench_plot", "outline", "samples", "ensemble_plot", "fit_plot", "plot", "tradeoff_plot"],
+    "_cli": ["clock", "report", "bench_verb", "montecarlo_verb", "main"],
 }
 DOORS = ["plot", "scene_file", "cli"]  # public modules, which hand on what rooms hold; so does the package itself
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -16,6 +16,10 @@ from .clock import BEGAN, CPU_BEFORE
 from .report import finite, motion_of, state_of, table_of, unit_of
 
 DONE, BAD_INPUT, FAILED = 0, 2, 3
+_IN_BOTH = (
+    "tradeoff",
+    "bench",
+)  # verbs that compute in float64 and in float32, and write their rows beside the picture
 
 
 _TABLES = (("simulate", "t1 = 2.0"), ("design", 'free = ["spin.y"] and a goal'),
@@ -69,9 +73,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    what = "Rough balls that fly and bounce: simulate a throw, design one, or measure error against time."
+    what = (
+        "Rough balls that fly and bounce: simulate a throw, design one, draw many, or measure errors, times and rates."
+    )
     codes = "Exit code: 0 done, 2 bad input, 3 the computation failed."
-    from .montecarlo_verb import add_options
+    from . import bench_verb, montecarlo_verb
 
     parser = _Parser("nonholo", description=what, epilog=codes, allow_abbrev=False)
     parser.add_argument("--version", action="version", version=f"nonholo_jax {metadata.version('nonholo_jax')}")
@@ -81,19 +87,24 @@ def _parser() -> argparse.ArgumentParser:
         ("design", "find the throw that reaches the goal of a scene file"),
         ("tradeoff", "measure error against time for every way to run a scene file"),
         ("montecarlo", "draw many throws of a scene file and say what they do"),
+        ("bench", "measure throws and bounces a second on every device, of a scene file or of three scenes"),
     ):
         each = verbs.add_parser(verb, help=purpose, description=purpose.capitalize() + ".", allow_abbrev=False)
-        each.add_argument("scene", metavar="SCENE.toml", help="scene file; see experiments/scenes for examples")
+        count: dict[str, Any] = {"nargs": "?"} if verb == "bench" else {}
+        each.add_argument(
+            "scene", metavar="SCENE.toml", help="scene file; see experiments/scenes for examples", **count
+        )
         each.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
         each.add_argument("--out", metavar="DIR", help="folder for what is written (default: nonholo-out/SCENE)")
         each.add_argument("--no-plot", action="store_true", help="draw no picture")
-        if verb != "tradeoff":
+        if verb not in _IN_BOTH:
             each.add_argument("--float32", action="store_true", help="compute in float32 instead of float64")
-        if verb == "montecarlo":
-            add_options(each)
+        else:
+            each.set_defaults(float32=False)
+        if verb in ("montecarlo", "bench"):
+            (montecarlo_verb if verb == "montecarlo" else bench_verb).add_options(each)
         if verb != "tradeoff":
             continue
-        each.set_defaults(float32=False)
         each.add_argument("-n", "--throws", type=int, default=256, help="size of the batch (default: %(default)s)")
         spread = "throws differ by this part of the speed, and of the radius in position (default: %(default)s)"
         each.add_argument("--spread", type=float, default=0.01, help=spread)
@@ -112,14 +123,15 @@ def _run(options: argparse.Namespace, from_start: bool) -> int:
         try:
             if options.verb == "montecarlo":
                 _join(options)
-            file = load_scene(options.scene)
+            file = None if options.scene is None else load_scene(options.scene)
         except ValueError as error:
             raise _BadInput(str(error)) from None
         for table, example in _TABLES:
-            if table in ("simulate", options.verb.replace("monte", "monte_")) and getattr(file, table) is None:
+            wanted = file is not None and table in ("simulate", options.verb.replace("monte", "monte_"))
+            if wanted and getattr(file, table) is None:
                 what = f"`{table}` must be given for nonholo {options.verb}, but got nothing"
                 raise _BadInput(f"{options.scene}: {what}; add [{table}] with {example}")
-        writes = options.verb in ("tradeoff", "montecarlo") or not options.no_plot
+        writes = options.verb in (*_IN_BOTH, "montecarlo") or not options.no_plot
         folder = options.folder = _writable(options) if writes else None
         clock = _CompileClock()
         if sys.stderr.isatty():
@@ -129,7 +141,7 @@ def _run(options: argparse.Namespace, from_start: bool) -> int:
         except ValueError as error:  # arguments that only the computation itself can judge
             if not (str(error).startswith("Argument ") or type(error).__name__ == "StoreError"):
                 raise  # a fault of ours
-            raise _BadInput(f"{options.scene}: {error}") from None
+            raise _BadInput(f"{options.scene or options.verb}: {error}") from None
         except KeyboardInterrupt:
             if options.verb != "montecarlo":
                 raise
@@ -139,10 +151,10 @@ def _run(options: argparse.Namespace, from_start: bool) -> int:
         picture = None
         if folder is not None and not options.no_plot:
             began = time.perf_counter()
-            picture = _draw(options.verb, file.scene, answer, folder)
+            picture = _draw(options.verb, None if file is None else file.scene, answer, folder)
             seconds["plot"] = time.perf_counter() - began
-        if folder is not None and options.verb == "tradeoff":
-            _written(finite(answer.report), folder / "tradeoff.json")
+        if folder is not None and options.verb in _IN_BOTH:
+            _written(finite(answer.report), folder / f"{options.verb}.json")
         _show(options, answer, seconds, picture)
     if answer.failure is not None:
         print(f"nonholo: {options.scene}: {' '.join(answer.failure.split())}", file=sys.stderr)
@@ -167,7 +179,7 @@ def _choose_for_xla(verb: str) -> None:
     generator on the CPU: compilation takes three quarters of the time, and one motion runs as fast. Other versions may
     not know that flag, and XLA stops at a flag that it does not know. What is chosen already stays."""
     flags = {"--xla_cpu_use_fusion_emitters=": "false"} if metadata.version("jaxlib").startswith("0.10.") else {}
-    if verb == "montecarlo":
+    if verb in ("montecarlo", "bench"):
         own = getattr(os, "sched_getaffinity", None)  # the cores that this process may use, where the system says so
         flags["--xla_force_host_platform_device_count="] = str(len(own(0)) if own else os.cpu_count() or 1)
     chosen = os.environ.get("XLA_FLAGS", "")
@@ -221,8 +233,8 @@ class _CompileClock:
 
 def _writable(options: argparse.Namespace) -> Path:
     """The folder of what is written, made if need be."""
-    own = Path("nonholo-out") / Path(options.scene).stem
-    own = own / "montecarlo" if options.verb == "montecarlo" else own
+    own = Path("nonholo-out") / Path(options.scene or "").stem
+    own = own / options.verb if options.verb in ("montecarlo", "bench") else own
     folder = own if options.out is None else Path(options.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -239,9 +251,9 @@ def _writable(options: argparse.Namespace) -> Path:
 
 def _draw(verb: str, scene: Any, answer: _Answer, folder: Path) -> str | None:
     """Write the picture; `None` where there is nothing to draw, which the answer then says."""
-    from .._pictures import plot_ensemble, plot_tradeoff, plot_trajectory
+    from .._pictures import plot_bench, plot_ensemble, plot_tradeoff, plot_trajectory
 
-    draw = {"tradeoff": plot_tradeoff, "montecarlo": plot_ensemble}.get(verb)
+    draw = {"tradeoff": plot_tradeoff, "montecarlo": plot_ensemble, "bench": plot_bench}.get(verb)
     path = folder / ("trajectory.png" if draw is None else f"{verb}.png")
     try:
         if draw is not None:
@@ -380,6 +392,15 @@ def _montecarlo(file: Any, options: argparse.Namespace) -> _Answer:
     return _Answer(whole, text, None, {"found": found}, None)
 
 
+def _bench(file: Any, options: argparse.Namespace) -> _Answer:
+    from .bench_verb import run
+
+    options.stem = None if options.scene is None else Path(options.scene).stem
+    found = run(file, options, progress=sys.stderr.isatty())
+    throw = {} if file is None else {"throw": state_of(file.throw)}
+    return _Answer({**throw, **found.report()}, found.table(), None, {"found": found}, None)
+
+
 def _scattered(file: Any, n: int, spread: float, seed: int) -> Any:
     """The throw of the file, n times, each a little different."""
     import jax
@@ -399,7 +420,7 @@ def _scattered(file: Any, n: int, spread: float, seed: int) -> Any:
     return BallState(*fields, orientation=turned)
 
 
-_VERBS = {"simulate": _simulate, "design": _design, "tradeoff": _tradeoff, "montecarlo": _montecarlo}
+_VERBS = {"simulate": _simulate, "design": _design, "tradeoff": _tradeoff, "montecarlo": _montecarlo, "bench": _bench}
 
 
 # Printing
@@ -411,7 +432,7 @@ def _show(options: argparse.Namespace, answer: _Answer, seconds: dict[str, float
         whole = head | answer.report | {"seconds": seconds, "picture": picture}
         print(json.dumps(finite(whole), allow_nan=False), flush=True)
         return
-    print(f"{options.scene}: " + "\n".join(answer.text))
+    print(f"{options.scene or options.verb}: " + "\n".join(answer.text))
     if picture is not None:
         print(f"  picture: {picture}")
     print("  seconds: " + ", ".join(f"{name} {value:.2f}" for name, value in seconds.items()), flush=True)

@@ -1,5 +1,6 @@
-"""Pictures of throws, studies, fits and trade-offs; matplotlib is loaded only when one is drawn."""
+"""Pictures of throws, studies, fits, trade-offs and rates; matplotlib is loaded only when one is drawn."""
 
+from .bench_plot import plot_bench as plot_bench
 from .ensemble_plot import plot_ensemble as plot_ensemble
 from .fit_plot import plot_fits as plot_fits
 from .plot import plot_trajectory as plot_trajectory

@@ -1,5 +1,6 @@
-"""What is asked of one motion: diagnostics, goals, design, fits to measurements, error against time."""
+"""What is asked of one motion: diagnostics, goals, design, fits to measurements, error against time, rates."""
 
+from .bench import Case as Case, bench as bench
 from .design import Design as Design, design as design
 from .diagnostics import (
     energy as energy,
@@ -17,4 +18,5 @@ from .goal import (
     as_point as as_point,
 )
 from .names import expand as expand, read as read, write as write
+from .rates import Bench as Bench, Rate as Rate
 from .tradeoff import Row as Row, Tradeoff as Tradeoff, tradeoff as tradeoff

@@ -196,7 +196,7 @@ def tradeoff(
     if gradients:
         also, slopes_apart = study.measure_gradients()
     rows, n = study.timed(runs), states.position.shape[0]
-    return Tradeoff(rows, words + also, apart, slopes_apart, n, study.setting.sum_trains, _machine())
+    return Tradeoff(rows, words + also, apart, slopes_apart, n, study.setting.sum_trains, machine(jax.devices()[:1]))
 
 
 class _Job(NamedTuple):
@@ -367,9 +367,12 @@ def _against_fifty_digits(setting: Setting, known: Outcome) -> tuple[int, float]
     return len(apart), max(apart, default=math.inf)
 
 
-def _machine() -> str:
+def machine(devices: Sequence[jax.Device]) -> str:
+    """Kinds of devices, with their numbers where there are several, processor and versions: what times depend on."""
+    kinds = [device.device_kind for device in devices]
+    names = [f"{kinds.count(kind)} x {kind}" if kinds.count(kind) > 1 else kind for kind in dict.fromkeys(kinds)]
     versions = f"Python {platform.python_version()}, JAX {jax.__version__}, Diffrax {diffrax.__version__}"
-    return f"{jax.devices()[0].device_kind}, {platform.machine()}, {versions}"
+    return f"{', '.join(names)}, {platform.machine()}, {versions}"
 
 
 def _check(scene, states, t0, t1, solvers, tolerances, steps, dtypes, runs) -> None:
