@@ -143,7 +143,7 @@ def bench(
 class Program:
     """One compiled program on the devices of one kind, with its batch on them, and how long it took to get there."""
 
-    def __init__(self, case: Case, devices: Sequence[jax.Device], dtype: str, job: str, throws: int):
+    def __init__(self, case: Case, devices: Sequence[Any], dtype: str, job: str, throws: int):
         lanes, alike, constants = _batch(case, dtype, throws)
         axes = 0 if alike is None else None
         self.throws, self.devices = throws, list(devices) if throws >= len(devices) else list(devices[:1])
@@ -232,7 +232,7 @@ class _Study:
             self.bar.set_description_str(f"{name}: {kind}, {dtype}, {job}, {throws} throws")
             try:
                 program = Program(case, self.devices[kind], dtype, job, throws)
-                rung = Rung(throws, program.roughly(), program.program_bytes)
+                rung = Rung(throws, program.roughly(), program.program_bytes, len(program.devices))
             except jax.errors.JaxRuntimeError as error:
                 if "RESOURCE_EXHAUSTED" not in str(error) or not programs:
                     raise

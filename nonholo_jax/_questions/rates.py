@@ -14,11 +14,13 @@ _REASONS = (
 
 
 class Rung(NamedTuple):
-    """A batch size that was run: seconds of one run, and bytes that it takes where that is known."""
+    """A batch size that was run: seconds of one run, bytes that it takes where that is known, how many devices share
+    it."""
 
     throws: int
     seconds: float
     bytes: int | None
+    devices: int = 1
 
 
 def climb(run: Callable[[int], Rung | None], most: int, room: int | None) -> tuple[list[Rung], str]:
@@ -36,7 +38,9 @@ def climb(run: Callable[[int], Rung | None], most: int, room: int | None) -> tup
             return found, "memory"
         found.append(rung)
         rates = [each.throws / each.seconds for each in found]
-        if len(found) > 1 and rung.seconds >= SHORTEST and rates[-1] < FLAT * rates[-2]:
+        # A batch that is the first to be shared by all devices takes longer to launch.
+        alike = len(found) > 1 and rung.seconds >= SHORTEST and rung.devices == found[-2].devices
+        if alike and rates[-1] < FLAT * rates[-2]:
             return found, "flat"
         if rung.seconds > LONGEST:
             return found, "time"

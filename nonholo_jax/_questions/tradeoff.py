@@ -367,7 +367,7 @@ def _against_fifty_digits(setting: Setting, known: Outcome) -> tuple[int, float]
     return len(apart), max(apart, default=math.inf)
 
 
-def machine(devices: Sequence[jax.Device]) -> str:
+def machine(devices: Sequence[Any]) -> str:
     """Kinds of devices, with their numbers where there are several, processor and versions: what times depend on."""
     kinds = [device.device_kind for device in devices]
     names = [f"{kinds.count(kind)} x {kind}" if kinds.count(kind) > 1 else kind for kind in dict.fromkeys(kinds)]

@@ -43,6 +43,11 @@ def test_a_rate_is_not_called_flat_while_the_launch_is_measured():
     assert ladder(0.0, 1e-9, most=10**5) == (6, "most")
 
 
+def test_a_rate_is_not_called_flat_where_more_devices_begin_to_share_the_batch():
+    slower = lambda n: Rung(n, 0.01 if n == 1 else 0.2, None, 1 if n == 1 else 2)  # noqa: E731
+    assert len(climb(slower, 10**4, None)[0]) == 5
+
+
 @pytest.mark.parametrize("most, sizes", [(1, 1), (9, 1), (10, 2), (99, 2), (100, 3)])
 def test_sizes_end_at_the_most_that_were_asked_for(most, sizes):
     assert ladder(1.0, 0.0, most=most) == (sizes, "most")
