@@ -1,19 +1,19 @@
 """`nonholo bench`: its options, and what is measured."""
 
 import argparse
-from typing import Any
+import math
+from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
-
-from .._questions import Bench, bench
+if TYPE_CHECKING:  # the other verbs need nothing of this
+    from .._questions import Bench
+else:
+    Bench = Any
 
 
 def whole(text: str) -> int:
     """A whole number, which may be written as 1e6."""
     number = float(text)
-    if number != int(number):
+    if not math.isfinite(number) or number != int(number):
         raise ValueError(text)
     return int(number)
 
@@ -29,18 +29,27 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(file: Any | None, options: argparse.Namespace, progress: bool) -> Bench:
     """The benchmark of a scene file, or of the scenes that come with the package."""
+    from .._questions import bench
+
     listed = {name: getattr(options, name) for name in ("devices", "dtypes", "jobs")}
     wanted = {name: [x.strip() for x in text.split(",")] for name, text in listed.items() if text is not None}
     how: dict[str, Any] = {**wanted, "most": options.most, "seed": options.seed, "progress": progress}
     if file is None:
         return bench(**how)
     drawn = {"throw": file.throw} if file.monte_carlo is None else {"draw": draws(file, options.seed)}
-    return bench(file.scene, **drawn, **file.simulate.arguments, name=options.stem, **how)
+    found = bench(file.scene, **drawn, **file.simulate.arguments, name=options.stem, **how)
+    if "draw" in drawn:
+        found.scenes[options.stem]["throws"] = f"drawn from [monte_carlo] of the file, seed {options.seed}"
+    return found
 
 
 def draws(file: Any, seed: int) -> Any:
     """A function that draws n throws, and scenes if these vary, from the `[monte_carlo]` table of a scene file. Throw i
     depends on the seed and on i alone."""
+    import equinox as eqx
+    import jax.numpy as jnp
+    import numpy as np
+
     sampler, scene = file.monte_carlo.sampler, file.scene
 
     def draw(n: int) -> Any:

@@ -111,8 +111,8 @@ def bench(
         the rate, a run takes longer than 2 s, or ten times the throws would not fit half of the free memory.
     - `runs`: >= 1, how often each row is timed, by turns. `seed` of the throws. `progress`: show a bar.
 
-    Returns a `Bench`. Raises `ValueError` for arguments that cannot be right, and for devices that are not there. Each
-    batch size is a program of its own; compiling them takes most of the time, minutes for the scenes of the package.
+    Returns a `Bench`. Raises `ValueError` for arguments that cannot be right and devices that are not there. Each batch
+    size is a program of its own: compiling them takes most of the time, ten minutes for the scenes of the package.
 
     ```python
     from nonholo_jax import Ball, BallState, Plane, Rough, Scene, bench
@@ -122,19 +122,13 @@ def bench(
     print(found.rows[0].bounces_per_second, found.rows[0].compile_seconds)
     ```
     """
-    dtypes = (DTYPES if jnp.zeros(()).dtype == jnp.float64 else ("float32",)) if dtypes is None else tuple(dtypes)
-    _check(dtypes, jobs, most, runs, seed)
+    wanted = _checked_dtypes(dtypes)
+    _check(jobs, most, runs, seed)
     there = _there(devices)
-    if scene is None:
-        _check_absent({"throw": throw, "t1": t1, "draw": draw, "motion": motion})
-        cases = built_in(seed)
-    else:
-        _check_scene(scene, throw, draw, t0, t1)
-        how = {"t0": t0, "t1": t1, "max_impacts": max_impacts, "motion": motion, "sum_trains": sum_trains}
-        drawn = "as drawn by `draw`"
-        cases = {name: case(scene, throw, how, seed) if throw is not None else Case(scene, draw, drawn, how)}  # pyright: ignore[reportArgumentType]
+    how = {"t1": t1, "t0": t0, "max_impacts": max_impacts, "motion": motion, "sum_trains": sum_trains}
+    cases = _cases(name, scene, throw, draw, how, seed)
     scenes = {each: _about(one) for each, one in cases.items()}
-    study = _Study(there, dtypes, tuple(jobs), most, runs, progress)
+    study = _Study(there, wanted, tuple(jobs), most, runs, progress)
     rows = tuple(row for each, one in cases.items() for row in study.rows(each, one))
     used = [device for kind in there.values() for device in kind]
     return Bench(rows, scenes, machine(used), bool(jax.config.jax_compilation_cache_dir))  # pyright: ignore[reportAttributeAccessIssue]
@@ -348,26 +342,42 @@ def _there(wanted: Sequence[str] | None) -> dict[str, list]:
     return {kind: found[kind] for kind in wanted}
 
 
-def _check(dtypes: tuple, jobs: Sequence[str], most: Any, runs: Any, seed: Any) -> None:
-    for name, values, known in (("dtypes", dtypes, DTYPES), ("jobs", tuple(jobs), JOBS)):
-        if not values or any(value not in known for value in values) or len(set(values)) < len(values):
-            raise ValueError(f"Argument `{name}` must be some of {known}, but got {values!r}; try {known[:1]}.")
-    for name, value, least in (("most", most, 1), ("runs", runs, 1), ("seed", seed, 0)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            what = f"must be a whole number of at least {least}, but got {value!r}"
-            raise ValueError(f"Argument `{name}` {what}; try leaving it out.")
-    if "float64" in dtypes and jnp.zeros(()).dtype != jnp.float64:
+def _cases(name: str, scene: Any, throw: Any, draw: Any, how: dict[str, Any], seed: int) -> dict[str, Case]:
+    """What is to run, by name."""
+    if scene is not None:
+        _check_scene(scene, throw, draw, how["t0"], how["t1"])
+        return {name: case(scene, throw, how, seed) if draw is None else Case(scene, draw, "as `draw` draws them", how)}
+    for what, value in {"throw": throw, "draw": draw, "t1": how["t1"], "motion": how["motion"]}.items():
+        if value is not None:
+            problem = f"must come with `scene`, but got {type(value).__name__} without one"
+            raise ValueError(f"Argument `{what}` {problem}; try bench(scene, throw, t1=1.0).")
+    return built_in(seed)
+
+
+def _checked_dtypes(dtypes: Sequence[str] | None) -> tuple[str, ...]:
+    double = jnp.zeros(()).dtype == jnp.float64
+    if dtypes is None:
+        return DTYPES if double else ("float32",)
+    _check_words("dtypes", dtypes, DTYPES)
+    if "float64" in dtypes and not double:
         raise ValueError(
             "Argument `dtypes` must be ('float32',) where JAX computes in float32 only, but got "
             f"{dtypes!r}; try jax.config.update('jax_enable_x64', True) first."
         )
+    return tuple(dtypes)
 
 
-def _check_absent(given: dict[str, Any]) -> None:
-    for name, value in given.items():
-        if value is not None:
-            what = f"must come with `scene`, but got {type(value).__name__} without one"
-            raise ValueError(f"Argument `{name}` {what}; try bench(scene, throw, t1=1.0).")
+def _check_words(name: str, values: Sequence[str], known: tuple[str, ...]) -> None:
+    if not values or any(value not in known for value in values) or len(set(values)) < len(values):
+        raise ValueError(f"Argument `{name}` must be some of {known}, but got {values!r}; try {known[:1]}.")
+
+
+def _check(jobs: Sequence[str], most: Any, runs: Any, seed: Any) -> None:
+    _check_words("jobs", jobs, JOBS)
+    for name, value, least in (("most", most, 1), ("runs", runs, 1), ("seed", seed, 0)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            what = f"must be a whole number of at least {least}, but got {value!r}"
+            raise ValueError(f"Argument `{name}` {what}; try leaving it out.")
 
 
 def _check_scene(scene: Any, throw: Any, draw: Any, t0: Any, t1: Any) -> None:

@@ -77,7 +77,7 @@ def test_without_a_scene_there_are_three(tmp_path, capsys, monkeypatch):
     )  # fmt: skip
     asked = {}
     made = lambda **how: asked.update(how) or _questions.Bench(rows, scenes, "one machine", False)  # noqa: E731
-    monkeypatch.setattr("nonholo_jax._cli.bench_verb.bench", made)
+    monkeypatch.setattr(_questions, "bench", made)
     assert main(["bench", "--most", "1e3", "--devices", "cpu,gpu"]) == 0
     out = capsys.readouterr().out
     assert asked["most"] == 1000 and asked["devices"] == ["cpu", "gpu"] and "jobs" not in asked
@@ -100,9 +100,12 @@ def test_throws_are_those_of_the_monte_carlo_table(tmp_path, also, own):
         assert restitution.shape == (2000,) and 0.8 <= restitution.min() < restitution.max() <= 0.9
 
 
-@pytest.mark.parametrize("option, value", [("--most", "0"), ("--most", "many"), ("--most", "1.5"), ("--seed", "-1"),
-                                           ("--devices", "abacus"), ("--devices", "cpu,cpu"), ("--devices", ""),
-                                           ("--dtypes", "float16"), ("--jobs", "hessian")])  # fmt: skip
+BAD = [("--most", "0"), ("--most", "many"), ("--most", "1.5"), ("--most", "inf"), ("--seed", "-1"),
+       ("--devices", "abacus"), ("--devices", "cpu,cpu"), ("--devices", ""), ("--dtypes", "float16"),
+       ("--jobs", "hessian")]  # fmt: skip
+
+
+@pytest.mark.parametrize("option, value", BAD)
 @pytest.mark.parametrize("with_scene", [True, False])
 def test_bad_options_are_one_line(tmp_path, capsys, option, value, with_scene):
     scene = [str(written(tmp_path, SCENE))] if with_scene else []
