@@ -9,7 +9,7 @@ SHORTEST = 1e-3  # s, where a run takes as long: before, it is the launch that i
 LONGEST = 2.0  # s, or where a run takes longer
 _REASONS = (
     f"sizes end where {STEP} times the throws give less than {FLAT} times the rate (flat), where a run takes over "
-    f" {LONGEST:g} s (time), where more would not fit (memory), or at the most that were asked for (most)"
+    f"{LONGEST:g} s (time), where more would not fit (memory), or at the most that were asked for (most)"
 )
 
 

@@ -2,6 +2,9 @@
 
 import json
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -177,6 +180,30 @@ def test_the_gradient_is_that_of_the_mean_squared_final_position():
     assert np.asarray(slope.position) == pytest.approx(np.asarray(2 * end / 4), rel=1e-12)
     assert np.asarray(slope.velocity) == pytest.approx(np.asarray(2 * t * end / 4), rel=1e-12)
     assert (slope.spin == 0.0).all()
+
+
+SHARED = """
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from nonholo_jax import Ball, BallState, Plane, Rough, Scene
+from nonholo_jax._questions.bench import Program, case
+scene = Scene(Ball(0.025, 0.046), {"floor": Plane((0, 0, 0), (0, 0, 1), Rough())})
+throw = BallState([0.0, 0.0, 1.0], [1.0, 0.0, -2.0], [0.0, 5.0, 0.0])
+one = case(scene, throw, {"t0": 0.0, "t1": 1.5, "max_impacts": 8})
+for job in ("value", "gradient"):
+    alone, shared = (Program(one, jax.devices()[:k], "float64", job, 5) for k in (1, 2))
+    assert (len(alone.devices), len(shared.devices)) == (1, 2) and alone.bounces == shared.bounces > 5
+    for x, y in zip(jax.tree.leaves(alone.call()), jax.tree.leaves(shared.call()), strict=True):
+        assert len(y.sharding.device_set) == 2 and np.allclose(x, y[:5], rtol=1e-12, atol=1e-12)
+print("alike")
+"""
+
+
+def test_devices_that_share_a_batch_compute_what_one_does():
+    flags = f"--xla_force_host_platform_device_count=2 {os.environ.get('XLA_FLAGS', '')}"
+    environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(Path(__file__).parents[2])}
+    done = subprocess.run([sys.executable, "-c", SHARED], env=environment, capture_output=True, text=True)
+    assert done.stdout == "alike\n", done.stderr
 
 
 def test_scenes_may_differ_from_throw_to_throw():
