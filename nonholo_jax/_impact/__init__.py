@@ -1,7 +1,7 @@
 """What an impact does to velocities: the projector, contact laws, corners, trains of bounces, rolling and sliding."""
 
 from . import rolling as rolling, train as train
-from .corner import collide_with_all as collide_with_all, is_one_mu as is_one_mu
+from .corner import collide_with_all as collide_with_all, is_one_mu as is_one_mu, rows_of as rows_of
 from .law import AbstractContactLaw as AbstractContactLaw, Frictional as Frictional, Rough as Rough, Smooth as Smooth
 from .projector import (
     accelerate as accelerate,

@@ -1,6 +1,5 @@
 """A ball that hits several surfaces at one instant: their constraints in one B, which may be rank-deficient (4.2)."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,35 +18,33 @@ def is_one_mu(law: AbstractContactLaw) -> bool:
     return law.rolls is False or (rough and same)
 
 
-def _rows(law: AbstractContactLaw, n: Any) -> Any:
-    """B on (velocity, radius times spin), which is what the contact point must not do: move, or move inwards."""
-    if not law.rolls:
-        return jnp.concatenate([n, jnp.zeros_like(n)])[None]
-    turn = jnp.cross(n[None], jnp.eye(3, dtype=n.dtype)).T  # v - r omega x n = v + n x (r omega)
-    return jnp.concatenate([jnp.eye(3, dtype=n.dtype), turn], axis=1)
+def rows_of(law: AbstractContactLaw, normal: Vector3, hit: Any, dtype: Any) -> Any:
+    """B on (velocity, radius times spin), which is what the contact point must not do: move, or move inwards. Zeros for
+    a surface that is not hit."""
+    n = jnp.stack([jnp.asarray(c, dtype=dtype) for c in normal])
+    if law.rolls:
+        turn = jnp.cross(n[None], jnp.eye(3, dtype=n.dtype)).T  # v - r omega x n = v + n x (r omega)
+        rows = jnp.concatenate([jnp.eye(3, dtype=n.dtype), turn], axis=1)
+    else:
+        rows = jnp.concatenate([n, jnp.zeros_like(n)])[None]
+    return jnp.where(hit, rows, jnp.zeros_like(rows))
 
 
 def collide_with_all(
     radius: Number,
     inertia_ratio: Number,
-    laws: Sequence[AbstractContactLaw],
-    normals: Sequence[Vector3],
-    hit: Sequence[Any],
+    rows: Any,
     restitution: Number,
     velocity: Vector3,
     spin: Vector3,
 ) -> tuple[Vector3, Vector3]:
-    """Velocity and spin after an impact on all the surfaces that are `hit`, by the stacked projector."""
+    """Velocity and spin after an impact on all surfaces whose `rows` are stacked, shape (k, 6), by their projector."""
     like = jnp.stack([jnp.asarray(x) for x in velocity])
-    blocks = []
-    for law, n, flag in zip(laws, normals, hit, strict=True):
-        block = _rows(law, jnp.stack([jnp.asarray(c, dtype=like.dtype) for c in n]))
-        blocks.append(jnp.where(flag, block, jnp.zeros_like(block)))
     weight = jnp.asarray(inertia_ratio, dtype=like.dtype) ** 0.5
     stretch = jnp.concatenate([jnp.ones(3, like.dtype), jnp.full(3, weight)])  # the metric becomes the identity
     turn = radius * jnp.stack([jnp.asarray(w, dtype=like.dtype) for w in spin])
     y = stretch * jnp.concatenate([like, turn])
-    basis = _orthonormal(jnp.concatenate(blocks) / stretch[None])
+    basis = _orthonormal(rows / stretch[None])
     after = (y - (1.0 + restitution) * matmul(matmul(basis, y), basis)) / stretch
     return components(after[:3]), components(after[3:] / radius)  # pyright: ignore[reportReturnType]
 

@@ -1,6 +1,16 @@
 """Mathematics without a ball: triples of scalars, sharing, polynomials, bounds, rotations, tiles, tangents, words."""
 
 from .gap import bend_of as bend_of, gradient_of as gradient_of, reach_of as reach_of, value_of as value_of
+from .hops import (
+    ENDS as ENDS,
+    FULL as FULL,
+    PAUSES as PAUSES,
+    Block as Block,
+    Hopper as Hopper,
+    Wall as Wall,
+    hop as hop,
+    hop_again as hop_again,
+)
 from .polynomial import (
     Interval as Interval,
     Polynomial as Polynomial,

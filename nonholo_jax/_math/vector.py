@@ -186,11 +186,20 @@ def beyond(x: Number, bound: Number) -> Number:
 
 
 class Choice:
-    """One of `count` things by a traced index, whose comparisons are made once, however much is chosen by them."""
+    """One of several things by a traced index, whose comparisons are made once, however much is chosen by them. With
+    `sizes`, a thing stands for so many values of the index; `members` are the things themselves, if they are known."""
 
-    def __init__(self, index: Any, count: int):
-        self.index = index
-        self._flags = [index == i for i in range(count)]
+    def __init__(self, index: Any, count: int, sizes: Sequence[int] = (), members: Sequence = ()):
+        self.index, self.members = index, members
+        self._flags, start = [], 0
+        for size in sizes or (1,) * count:
+            self._flags.append(index == start if size == 1 else (index >= start) & (index < start + size))
+            start += size
+
+    def extend(self, start: int, members: Sequence) -> None:
+        """More things, each for one value of the index, from `start` on."""
+        self._flags += [self.index == start + i for i in range(len(members))]
+        self.members = [*self.members, *members]
 
     def is_(self, i: int) -> Any:
         """Whether it is number i."""

@@ -6,7 +6,7 @@ the first step ends at the crossing; elsewhere steps converge to it quadraticall
 Newton correction of its result is, which is the implicit function theorem.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,7 +18,6 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from .._math import (
-    Choice,
     Index,
     Number,
     Polynomial,
@@ -35,7 +34,7 @@ from .._math import (
     total,
     where,
 )
-from .._world import AbstractSystem, Return, rounding
+from .._world import AbstractSystem, Member, Return, rounding
 
 
 class Arc(eqx.Module):
@@ -117,12 +116,12 @@ def _here(arc: Arc, s: Any) -> _Here:
     return _Here(s, coefficients, size, norm(tuple(p[1] for p in coefficients)))
 
 
-def _is_exact(system: AbstractSystem, contact: int, path: Sequence[Polynomial]) -> bool:
+def _is_exact(system: AbstractSystem, contact: Any, path: Sequence[Polynomial]) -> bool:
     """Whether the level along the path is a parabola, so that one step ends at its zero."""
     return system.is_parabolic(contact) and all(len(p) <= 3 for p in path)
 
 
-def _return(system: AbstractSystem, contact: int, arc: Arc) -> Return | None:
+def _return(system: AbstractSystem, contact: Any, arc: Arc) -> Return | None:
     """When a parabola that begins on a flat face comes back to it."""
     if any(len(p) > 3 for p in arc.configuration):
         return None
@@ -130,14 +129,14 @@ def _return(system: AbstractSystem, contact: int, arc: Arc) -> Return | None:
     return system.returns(contact, arc.time, *parts)
 
 
-def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, window: Any, touching: Choice) -> _Step:
+def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, window: Any, touching: Any) -> _Step:
     s, coefficients = here.s, here.coefficients
     left = arc.length - s
     value, rate = slope(lambda x: system.level(contact, arc.time, x, arc.start), here.position, here.tangent)
     noise = rounding(system, contact, here.size, s.dtype)
     exact = _is_exact(system, contact, coefficients)
     # A contact that has just been left has a gap of exactly zero that does not close; rounding may not say otherwise.
-    left_behind = touching.is_(contact) & (s == 0)
+    left_behind = (touching == _number(contact)) & (s == 0)
     width: Any = left
     if not exact:  # the reach is a first guess; from then on the window knows better
         reach = system.reach(contact, here.position)
@@ -173,6 +172,21 @@ def _safe_step(system: AbstractSystem, contact: int, arc: Arc, here: _Here, wind
     return _Step(size, hit, clear, rate, m, noise, falls)
 
 
+def _number(contact: Any) -> Any:
+    return contact.number if isinstance(contact, Member) else contact
+
+
+def _nearest(contacts: Any, step: Callable) -> tuple[_Step, Any]:
+    """The shortest step towards one contact, or towards one of a stack, and the number of the contact."""
+    if not isinstance(contacts, tuple) or isinstance(contacts, Member):
+        return step(contacts), np.int32(_number(contacts))
+    start, stack = contacts
+    as_arrays = lambda each: jax.tree.map(jnp.asarray, each)  # noqa: E731
+    steps = stack.each(start, lambda member: as_arrays(step(member)))
+    nearest = jnp.argmin(steps.size).astype(jnp.int32)
+    return jax.tree.map(lambda x: x[nearest], steps), start + nearest
+
+
 def _first_zero(value: Any, rate: Any, m: Any) -> Any:
     """The first zero of the parabola value + rate s + m s^2 / 2 that is not negative, where it closes."""
     disc = rate * rate - 2.0 * m * value
@@ -192,16 +206,16 @@ def search(system: AbstractSystem, arc: Arc, start: Any, window: Any, touching: 
     that the bound is tight where they are small: past a near miss it then turns positive at once. Not differentiated.
     """
     arc, system = frozen(arc), frozen(system)
-    touched = Choice(touching, system.n_contacts)
 
     def step(state: Search) -> Search:
         s, none = state.s, jnp.asarray(-1, dtype=jnp.int32)
         here = _here(arc, s)
         first, contact = _Step(jnp.asarray(jnp.inf, s.dtype), False, True, *_NOTHING), none
-        for i in range(system.n_contacts):
-            each = _safe_step(system, i, arc, here, state.window, touched)
+        step_towards = lambda contact: _safe_step(system, contact, arc, here, state.window, touching)  # noqa: E731
+        for contacts in system.contacts():
+            each, number = _nearest(contacts, step_towards)
             closer = each.size < first.size  # a tie goes to the first
-            contact = where(closer, np.int32(i), contact)
+            contact = where(closer, number, contact)
             first = _Step(*[where(closer, a, b) for a, b in zip(each, first, strict=True)])
         end = s + first.size
         hit = first.hit & (end <= arc.length)
@@ -223,7 +237,7 @@ def search(system: AbstractSystem, arc: Arc, start: Any, window: Any, touching: 
 _NOTHING = (0.0, 0.0, 0.0, False)  # of a level that is never zero
 
 
-def _noise(system: AbstractSystem, contact: int, arc: Arc) -> float:
+def _noise(system: AbstractSystem, contact: Any, arc: Arc) -> float:
     """The part of the speed below which the rate of a level at its zero is rounding. On a plane it is that of the
     velocity; elsewhere the zero itself is known only to the root of rounding where the level hardly changes."""
     eps = float(jnp.finfo(arc.time.dtype).eps)
@@ -241,17 +255,18 @@ def crossing_time(s: Scalar, contact: Index, system: AbstractSystem, arc: Arc) -
 @crossing_time.def_jvp
 def _crossing_time_jvp(primals: tuple, tangents: tuple) -> tuple:
     s, index, system, arc = primals
-    contact, contacts = Choice(index, system.n_contacts), range(system.n_contacts)
+    contact = system.choice(index)
 
     def level(system: AbstractSystem, arc: Arc, s: Any) -> Any:
         q = arc.position(s)
-        return contact.of([jnp.asarray(system.level(i, arc.time, q, arc.start), s.dtype) for i in contacts])
+        levels = [system.level(each, arc.time, q, arc.start) for each in contact.members]
+        return contact.of([jnp.asarray(level, s.dtype) for level in levels])
 
     s = crossing_time(*primals)
     _, rate = jax.jvp(lambda s: level(system, arc, s), (s,), (jnp.ones_like(s),))
     _, change = eqx.filter_jvp(lambda system, arc: level(system, arc, s), (system, arc), tangents[2:])
     # An arc that nothing cuts keeps its s: a division by nothing could overflow, and its derivative with it.
-    noise = where(index >= 0, contact.of([_noise(system, i, arc) for i in contacts]), jnp.inf)
+    noise = where(index >= 0, contact.of([_noise(system, each, arc) for each in contact.members]), jnp.inf)
     steep = jnp.abs(rate) > noise * frozen(norm(arc.tangent(s)))
     (slope,) = shared([where(steep, rate, 1.0)])
     return s, where(steep, -change / slope, 0.0)

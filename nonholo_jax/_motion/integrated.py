@@ -265,10 +265,15 @@ def _weights(interpolation: Any, b_sol: tuple, dtype: Any) -> np.ndarray:
     n = len(b_sol)
     nodes = [0.5 - 0.5 * np.cos(np.pi * (np.arange(degree) + 1) / degree) for degree in range(1, _HIGHEST + 1)]
     points = [*nodes, np.linspace(0.0, 1.0, 23)]  # 0 is known: the path starts there
-    with jax.ensure_compile_time_eval():
+
+    @jax.jit  # one program for all
+    def evaluate(times: Any) -> Any:
         ends = {"t0": jnp.zeros((), dtype), "t1": jnp.ones((), dtype), "y0": jnp.zeros(n, dtype)}
         path = interpolation(**ends, y1=jnp.asarray(b_sol, dtype), k=jnp.eye(n, dtype=dtype))
-        found = jax.jit(jax.vmap(path.evaluate))(jnp.asarray(np.concatenate(points), dtype))  # one program for all
+        return jax.vmap(path.evaluate)(times)
+
+    with jax.ensure_compile_time_eval():
+        found = evaluate(np.concatenate(points).astype(dtype))
     *samples, values = np.split(np.asarray(found, dtype=float), np.cumsum([len(x) for x in points])[:-1])
     eps = float(jnp.finfo(dtype).eps)
     for degree, (at, sample) in enumerate(zip(nodes, samples, strict=True), 1):

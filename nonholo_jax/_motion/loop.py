@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._math import KINDS, RESULTS, Choice, frozen, norm, shared, total, where
-from .._world import ENDS, FULL, PAUSES, AbstractSystem, Hopper, Meeting
+from .._math import ENDS, FULL, KINDS, PAUSES, RESULTS, Hopper, frozen, norm, shared, total, where
+from .._world import AbstractSystem, Meeting
 from .crossing import crossing_time, search
 from .motion import AbstractMotion
 
@@ -257,7 +257,7 @@ def turn(
     ended = active & kept & finished
     crossed = ended & (found.contact >= 0)
     through = ended & ~crossed
-    contact = Choice(found.contact, system.n_contacts)
+    contact = system.choice(found.contact)
     s = where(through, arc.length, found.s)
     if differentiable and system.n_contacts > 0:
         s = where(crossed, crossing_time(s, found.contact, system, arc), s)

@@ -16,7 +16,8 @@ import numpy as np
 from jax import lax
 
 from .._math import (
-    Choice,
+    ENDS,
+    PAUSES,
     Iteration,
     frozen,
     in_tiles,
@@ -26,7 +27,7 @@ from .._math import (
     where,
     where_needed,
 )
-from .._world import ENDS, PAUSES, AbstractSystem
+from .._world import AbstractSystem
 from .crossing import crossing_time
 from .loop import (
     Begun,
@@ -75,7 +76,7 @@ def _arc(system: AbstractSystem, motion: AbstractMotion, t1: Any, known: Known, 
     arrived = computed_once(arrived)
     after, until, since = arrived, time, begun.since + elapsed
     if system.n_contacts > 0:
-        contact = Choice(known.contact, system.n_contacts)
+        contact = system.choice(known.contact)
         other, pause = system.after(contact, time, arrived, kind_of(known.kind))
         after = keep(flags.struck, as_arrays(other, t1.dtype), arrived)
         until = where(flags.struck, time + pause, time)

@@ -192,8 +192,9 @@ def _ndim(owner: Any, path: tuple) -> int | None:
 def _run(scene, motion, state, t0, t1, max_impacts: int, log_rows: int, adjoint) -> Trajectory:
     scene = _cast(scene, t1.dtype)
     options = {"max_impacts": max_impacts, "log_rows": log_rows, "adjoint": adjoint}
-    outcome = run(scene, motion, scene.unpacked(state), t0, t1, **options)
-    return packaged(scene, motion, state, t0, outcome)
+    engine = scene.engine(t1.dtype)
+    outcome = run(engine, motion, engine.unpacked(state), t0, t1, **options)
+    return dataclasses.replace(packaged(engine, motion, state, t0, outcome), system=scene)
 
 
 @eqx.filter_jit
@@ -211,7 +212,7 @@ def _run_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, log
         def one(state, mapped):
             own, common = iter(mapped), iter(alike)
             each = [next(common) if axis is None else next(own) for axis in axes]
-            system = jax.tree.unflatten(treedef, each)
+            system = jax.tree.unflatten(treedef, each).engine(t1.dtype)
             outcome = run(system, motion, system.unpacked(state), t0, t1, **options)
             whole = packaged(system, motion, state, t0, outcome)
             return dataclasses.replace(whole, system=None, motion=None, initial=None)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._math import KINDS, RESULTS, Choice, along, frozen
+from .._math import KINDS, RESULTS, along, frozen
 from .._world import AbstractSystem
 from .loop import Outcome, kind_of, unpack_row
 from .motion import AbstractMotion
@@ -128,13 +128,13 @@ def _at_one(trajectory: Trajectory, t: Any) -> Any:
 
 def _in_train(trajectory: Trajectory, past: Any, n: Any, t: Any) -> tuple[Any, Any]:
     """Whether the time falls into the train that follows `past` rows of the log, and the state if it does."""
-    system, log = trajectory.system, trajectory.impacts
+    system, log = trajectory.system.engine(t.dtype), trajectory.impacts
     row = jnp.minimum(past, log.time.shape[0] - 1)
     time = log.time[row]
     summed = (past < n) & (time <= t) & (t < log.until[row])
     before = jax.tree.map(lambda a, b: jnp.where(summed, a[row], b), log.before, trajectory.initial)
     elapsed = jnp.where(summed, t - time, 0.0)
-    contact = Choice(jnp.maximum(log.surface[row], 0), system.n_contacts)
+    contact = system.choice(jnp.maximum(log.surface[row], 0))
     state = system.during(contact, time, system.unpacked(before), elapsed)
     return summed, jax.tree.map(lambda x: jnp.asarray(x, dtype=t.dtype), state)
 
@@ -148,7 +148,7 @@ def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any
     safe = jax.tree.map(jnp.nan_to_num, frozen(outcome.state))  # harmless numbers for the rows that are not used
     before = jax.tree.map(lambda a, b: jnp.where(along(used, a), a, b), row.before, safe)
     if system.n_contacts > 0:
-        frame = lambda i, *rest: system.contact_frame(Choice(i, system.n_contacts), *rest)  # noqa: E731
+        frame = lambda i, *rest: system.contact_frame(system.choice(i), *rest)  # noqa: E731
         point, normal = jax.vmap(frame)(contact, row.time, before)
         point, normal = (jnp.where(used[:, None], x, jnp.nan) for x in (point, normal))
     else:

@@ -5,9 +5,9 @@ from .ball import Ball as Ball, BallState as BallState, check_ball_state as chec
 from .box import Box as Box, Rectangle as Rectangle
 from .floors import slides_across as slides_across
 from .grounded import grounded as grounded
-from .hops import ENDS as ENDS, FULL as FULL, PAUSES as PAUSES, Hopper as Hopper
 from .lagrangian import Barrier as Barrier, LagrangianSystem as LagrangianSystem, as_arrays as as_arrays
 from .round import Cylinder as Cylinder, Sphere as Sphere
 from .scene import Scene as Scene
+from .stack import Member as Member, Stack as Stack
 from .surface import AbstractSurface as AbstractSurface, Implicit as Implicit, Plane as Plane, Return as Return
 from .system import AbstractSystem as AbstractSystem, Meeting as Meeting, magnitude as magnitude, rounding as rounding

@@ -1,14 +1,16 @@
 """The flat surfaces of a scene on which a ball may stay after its last bounce, and the choice among them."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.core
 import jax.numpy as jnp
 
-from .._impact import Contact, along_surface
+from .._impact import AbstractContactLaw, Contact, along_surface
 from .._math import Choice, Number, Vector3, components, dot, is_constant, norm, ratio, scale
 from .scene import Scene
+from .stack import Stack
 from .surface import AbstractSurface, Face
 
 
@@ -23,21 +25,22 @@ class Floors:
     """The surfaces of `scene` to stay on. Where a choice is none of them, what it gets are harmless numbers."""
 
     def __init__(self, scene: Scene):
-        self.indices = [i for i, surface in enumerate(scene.surfaces) if _can_settle(surface)]
-        self._surfaces = [scene.surfaces[i] for i in self.indices]
-        self._laws = [surface.law for surface in self._surfaces]
-        self._frictions = [law.sliding_friction() for law in self._laws]
-        self._ball = scene.ball
+        kinds = [each.surface if isinstance(each, Stack) else each for each in scene.surfaces]
+        self.indices = [i for i, surface in enumerate(kinds) if _can_settle(surface)]
+        self._ball, floors = scene.ball, [kinds[i] for i in self.indices]
         # Whether a ball may slide against friction, so that its slip is followed.
-        self.have_friction = any(friction is not None for friction in self._frictions)
-        self.have_edges = any(surface.has_edges for surface in self._surfaces)
+        self.have_friction = any(surface.law.sliding_friction() is not None for surface in floors)
+        self.have_edges = any(surface.has_edges for surface in floors)
 
     def include(self, contact: Choice) -> Any:
         return contact.among(self.indices)
 
+    def _of(self, contact: Choice, function: Callable[[AbstractSurface], Any]) -> Any:
+        return contact.of([function(contact.members[i].surface) for i in self.indices], self.indices)
+
     def face(self, contact: Choice, x: Vector3, time: Any) -> tuple[Face, Any]:
         """The face below a ball on that surface, and whether it has edges."""
-        faces: list[Any] = [surface.face(x, time) for surface in self._surfaces]
+        faces: list[Any] = [contact.members[i].surface.face(x, time) for i in self.indices]
         half = [(1.0, 1.0) if face.half is None else face.half for face in faces]
         vector = lambda options: contact.vector(options, self.indices)  # noqa: E731
         below = contact.of([jnp.asarray(face.below) for face in faces], self.indices)
@@ -48,30 +51,35 @@ class Floors:
 
     def rolls(self, contact: Choice) -> Any:
         """Whether a ball rolls on that surface, perhaps after sliding."""
-        flags: list[Any] = [bool(law.rolls) if f is None else f > 0
-                 for law, f in zip(self._laws, self._frictions, strict=True)]  # fmt: skip
-        return contact.of(flags, self.indices)
+        return self._of(contact, lambda surface: _rolls(surface.law))
 
     def friction(self, contact: Choice) -> Number:
         """The coefficient on that surface; infinite where a ball never slides or never rolls."""
-        return contact.of([jnp.inf if f is None else f for f in self._frictions], self.indices)
+        return self._of(contact, lambda surface: _friction(surface.law))
 
     def holds(self, contact: Choice) -> Any:
         """Whether a ball rolls on that surface whatever it meets."""
-        return contact.of([bool(law.rolls) and f is None or (f == jnp.inf)
-                           for law, f in zip(self._laws, self._frictions, strict=True)], self.indices)  # fmt: skip
+        return self._of(contact, lambda surface: _rolls(surface.law) & (_friction(surface.law) == jnp.inf))
 
     def law(self, contact: Choice) -> Contact:
         """What trains need of that surface."""
-        reversals: list = [law.reversal() for law in self._laws]
         return Contact(
-            contact.of([law.restitution for law in self._laws], self.indices),
-            contact.of(reversals, self.indices),
+            self._of(contact, lambda surface: surface.law.restitution),
+            self._of(contact, lambda surface: surface.law.reversal()),
             self.friction(contact) if self.have_friction else None,
             self.rolls(contact),
             self._ball.inertia_ratio,
             self._ball.radius,
         )
+
+
+def _friction(law: AbstractContactLaw) -> Number:
+    friction = law.sliding_friction()
+    return jnp.inf if friction is None else friction
+
+
+def _rolls(law: AbstractContactLaw) -> Any:
+    return bool(law.rolls) if law.sliding_friction() is None else _friction(law) > 0
 
 
 def slides_across(scene: Scene) -> bool:

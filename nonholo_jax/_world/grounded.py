@@ -16,6 +16,7 @@ from .._math import (
     KINDS,
     RESULTS,
     Choice,
+    Hopper,
     Number,
     Vector3,
     add,
@@ -33,9 +34,9 @@ from .._math import (
     where_vector,
 )
 from .floors import Floors
-from .hops import Hopper
 from .round import round_bend, round_level
 from .scene import Flight, Scene
+from .stack import Member
 from .surface import Face
 from .system import AbstractSystem, Meeting, bounces, magnitude, rounding
 
@@ -124,7 +125,7 @@ class Grounded(AbstractSystem):
 
     @property
     def _n_surfaces(self) -> int:
-        return len(self.scene.surfaces)
+        return self.scene.n_contacts
 
     @property
     def _end_of_slip(self) -> int:
@@ -135,6 +136,21 @@ class Grounded(AbstractSystem):
     @property
     def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         return (self._end_of_slip + self._floors.have_friction) if self.hits else 0
+
+    def engine(self, dtype):
+        return dataclasses.replace(self, scene=self.scene.engine(dtype))
+
+    def _others(self) -> list[int]:
+        """The contacts behind the surfaces."""
+        return list(range(self._n_surfaces, self.n_contacts))
+
+    def contacts(self):
+        return [*(self.scene.contacts() if self.hits else []), *self._others()]
+
+    def choice(self, index):
+        surfaces = self.scene.choice(index)
+        surfaces.extend(self._n_surfaces, self._others())
+        return surfaces
 
     # Smooth motion
 
@@ -152,7 +168,7 @@ class Grounded(AbstractSystem):
 
     def _ground(self, time: Any, state: Travel) -> Ground:
         flight, floors, on = state.flight, self._floors, state.support >= 0
-        support = Choice(self.phase(state), self._n_surfaces)
+        support = self.scene.choice(self.phase(state))
         face, edged = floors.face(support, flight.position, time)
         edged, rolls, ball, n = on & edged, on & floors.rolls(support), self.scene.ball, face.normal
         share = where(rolls, ratio(1.0, 1.0 + ball.inertia_ratio), 1.0)
@@ -226,13 +242,14 @@ class Grounded(AbstractSystem):
         """Along one pair of edges: across, middle, half size, and whether there are such edges."""
         below = self._below(time, state)
         assert below.face.half is not None
-        k = contact - self._n_surfaces
+        k = contact - self._n_surfaces  # of the two
         return below.face.tangents[k], below.face.center, below.face.half[k], below.edged
 
     def level(self, contact, time, q, state):
         x = q[:3]
-        if contact < self._n_surfaces:
-            return where(state.support == contact, 1.0, self.scene.level(contact, time, x, state.flight))
+        if isinstance(contact, Member):
+            on = state.support == contact.number
+            return where(on, 1.0, self.scene.level(contact, time, x, state.flight))
         if contact == self._end_of_slip:
             heading = self._below(time, state).heading
             return where(dot(heading, heading) > 0, dot(heading, q[3:]), 1.0)
@@ -241,20 +258,20 @@ class Grounded(AbstractSystem):
         return where(present, round_level((y,), half, True), 1.0)
 
     def is_parabolic(self, contact):
-        return contact == self._end_of_slip or (contact < self._n_surfaces and self.scene.is_parabolic(contact))
+        return self.scene.is_parabolic(contact) if isinstance(contact, Member) else contact == self._end_of_slip
 
     def returns(self, contact, time, q, v, half_a):
-        if contact >= self._n_surfaces:
+        if not isinstance(contact, Member):
             return None
         return self.scene.returns(contact, time, q[:3], v[:3], half_a[:3])
 
     def reach(self, contact, q):
-        return self.scene.reach(contact, q[:3]) if contact < self._n_surfaces else self.scene.ball.radius
+        return self.scene.reach(contact, q[:3]) if isinstance(contact, Member) else self.scene.ball.radius
 
     def bend(self, contact, time, window, state):
         place = window._replace(coefficients=window.coefficients[:3])
-        if contact < self._n_surfaces:
-            bend, skip = self.scene.bend(contact, time, place, state.flight), state.support == contact
+        if isinstance(contact, Member):
+            bend, skip = self.scene.bend(contact, time, place, state.flight), state.support == contact.number
         elif contact == self._end_of_slip:
             heading = self._below(time, state).heading
             bend = window._replace(coefficients=window.coefficients[3:]).along(heading, rolling.NONE).bend
@@ -269,7 +286,7 @@ class Grounded(AbstractSystem):
         return contact >= self._n_surfaces or self.scene.is_bounded(contact)
 
     def extent(self, contact):
-        return self.scene.extent(contact) if contact < self._n_surfaces else self.scene.ball.radius
+        return self.scene.extent(contact) if isinstance(contact, Member) else self.scene.ball.radius
 
     # What happens there
 
@@ -280,7 +297,7 @@ class Grounded(AbstractSystem):
 
     def _touch(self, contact: Choice, time: Any, state: Travel, n: Vector3, struck: Flight, pull: Vector3) -> Touch:
         floors = self._floors
-        floor = Choice(where(state.support >= 0, self.phase(state), contact.index), self._n_surfaces)
+        floor = self.scene.choice(where(state.support >= 0, self.phase(state), contact.index))
         face, edged = floors.face(floor, state.flight.position, time)
         first = train.start(struck.velocity, struck.spin, face.normal, pull, self.scene.ball.radius)
         law = floors.law(floor)
@@ -305,8 +322,12 @@ class Grounded(AbstractSystem):
             for across, half in zip(face.tangents, face.half, strict=True):
                 margin = half - abs(dot(across, subtract(x, face.center)))
                 room = minimum(room, where(touch.edged, margin, jnp.inf))
-        for i, surface in enumerate(self.scene.surfaces):
-            room = minimum(room, where(touch.floor.is_(i), jnp.inf, surface.clearance(x, touch.time, radius)))
+
+        def clear(other: Member) -> Number:
+            return where(touch.floor.index == other.number, jnp.inf, other.surface.clearance(x, touch.time, radius))
+
+        for each in self.scene.contacts():
+            room = minimum(room, clear(each) if isinstance(each, Member) else jnp.min(each[1].each(each[0], clear)))
         return room
 
     def _sums(self, touch: Touch, end: train.End) -> tuple[Any, Any, Any]:
@@ -329,7 +350,7 @@ class Grounded(AbstractSystem):
         """Whether a ball on its support stays on it when it hits a surface: Theorem 5.1 needs one common mu there, and
         a smooth wall turns the ball round."""
         rolls, stays = touch.on & self._floors.holds(touch.floor), []
-        for surface in self.scene.surfaces:
+        for surface in self.scene.chosen(touch.contact):
             law = surface.law
             common = bool(law.rolls) and law.sliding_friction() is None and law.reversal() == law.restitution
             stays.append(rolls & common if law.rolls else law.rolls is False)
@@ -454,7 +475,7 @@ class Grounded(AbstractSystem):
         velocity, spin = rolling.against_rough(
             ball.radius, ball.inertia_ratio, n, wall, mu, flight.velocity, flight.spin
         )
-        laws = [surface.law for surface in self.scene.surfaces]
+        laws = [surface.law for surface in self.scene.chosen(touch.contact)]
         if all(law.rolls is not False for law in laws):
             return velocity, spin
         smooth = touch.contact.of([law.rolls is False for law in laws])
@@ -477,7 +498,8 @@ class Grounded(AbstractSystem):
         which it moves off by less than rounding."""
         flight = touch.state.flight
         closing, size = dot(touch.normal, flight.velocity), magnitude(flight.position)
-        noises = [rounding(self, i, size, touch.time.dtype) for i in range(self._n_surfaces)]
+        surfaces = [each for each in touch.contact.members if isinstance(each, Member)]
+        noises = [rounding(self, each, size, touch.time.dtype) for each in surfaces]
         creeps = norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin) <= 64.0 * abs(closing)
         small = closing * closing <= 4.0 * pull * touch.contact.of(noises)
         return held & self._stays(touch) & creeps & small

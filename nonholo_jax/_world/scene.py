@@ -1,6 +1,7 @@
 """A scene: one ball, named surfaces, gravity and perhaps air."""
 
 import functools
+import itertools
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
@@ -10,17 +11,22 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._impact import collide_with_all, is_one_mu
+from .._impact import AbstractContactLaw, collide_with_all, is_one_mu, rows_of
 from .._math import (
+    Block,
     Choice,
+    Hopper,
     Number,
     Vector3,
+    Wall,
     Window,
     add,
     as_vector,
     components,
     cross,
     dot,
+    hop,
+    hop_again,
     is_constant,
     plus,
     ratio,
@@ -35,7 +41,7 @@ from .._math import (
 from .air import Air
 from .ball import Ball, BallState, check_ball_state
 from .box import AbstractBlock, along
-from .hops import Block, Hopper, Wall, hop, hop_again
+from .stack import Member, Stack, stacked
 from .surface import AbstractSurface, Plane
 from .system import AbstractSystem, bounces, magnitude, rounding
 
@@ -107,7 +113,7 @@ class Scene(AbstractSystem):
 
     @property
     def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return len(self.surfaces)
+        return len(self.names)
 
     def evolving(self, state: Flight) -> tuple:
         return state.position, state.velocity
@@ -147,42 +153,64 @@ class Scene(AbstractSystem):
     def bounced(self, contact, time, state):
         return self.struck(contact, time, state)[1]
 
-    def normals(self, time: Any, x: Vector3) -> list[Vector3]:
-        """Those of all surfaces, at a place."""
-        return [surface.direction(x, time) for surface in self.surfaces]
+    def engine(self, dtype):
+        return eqx.tree_at(lambda scene: scene.surfaces, self, stacked(self.surfaces, dtype))
+
+    def contacts(self):
+        starts = itertools.accumulate(self._sizes, initial=0)
+        return [(i, each) if isinstance(each, Stack) else Member(i, each) for i, each in zip(starts, self.surfaces)]  # noqa: B905
+
+    @property
+    def _sizes(self) -> tuple[int, ...]:
+        return tuple(each.count if isinstance(each, Stack) else 1 for each in self.surfaces)
+
+    def choice(self, index):
+        members = [each if isinstance(each, Member) else Member(index, each[1].at(index - each[0]))
+                   for each in self.contacts()]  # fmt: skip
+        return Choice(index, len(members), self._sizes, members)
+
+    def chosen(self, contact: Choice) -> list[AbstractSurface]:
+        """Of every class, the surface that may be the one."""
+        return [each.surface for each in contact.members if isinstance(each, Member)]
+
+    def normal(self, contact: Choice, time: Any, x: Vector3) -> Vector3:
+        return contact.vector([surface.direction(x, time) for surface in self.chosen(contact)])
 
     def restitution(self, contact: Choice) -> Number:
-        return contact.of([surface.law.restitution for surface in self.surfaces])
+        return contact.of([surface.law.restitution for surface in self.chosen(contact)])
 
     def struck(self, contact: Choice, time: Any, state: Flight) -> tuple[Vector3, Flight]:
         """The normal of a contact, and the state after an impact there: by Theorem 5.2, for any normal and any law; at
         a corner by (4.2), for all that is hit if that has one mu."""
-        normals = self.normals(time, state.position)
-        n = shared(contact.vector(normals))
+        n = shared(self.normal(contact, time, state.position))
         velocity, spin = self._after(contact, n, state.velocity, state.spin)
-        single = state._replace(velocity=velocity, spin=spin)
-        alike = [i for i, surface in enumerate(self.surfaces) if is_one_mu(surface.law)]
-        if len(alike) < 2:
-            return n, single
-        mu, known, size = self.restitution(contact), contact.among(alike), magnitude(state.position)
+        one_mu = [is_one_mu(_law(each)) for each in self.surfaces]
+        if sum(size for size, alike in zip(self._sizes, one_mu, strict=True) if alike) < 2:
+            return n, state._replace(velocity=velocity, spin=spin)
+        known = contact.among([i for i, alike in enumerate(one_mu) if alike])
+        mu, size = self.restitution(contact), magnitude(state.position)
 
-        def is_hit_too(i: int) -> Any:
-            """Whether a surface is touched and closed in on when another one is hit that has the same mu."""
-            touches = abs(self.level(i, time, state.position, state)) <= 16.0 * rounding(self, i, size, time.dtype)
-            closes, law = dot(normals[i], state.velocity) < 0, self.surfaces[i].law
-            same = True if law.restitution is mu else jnp.asarray(law.restitution == mu)
-            return known & (contact.is_(i) | (touches & closes & same))
+        def hit_too(member: Member) -> tuple:
+            """Whether a surface is touched and closed in on when another one is hit that has the same mu, and its
+            normal."""
+            direction, law = member.surface.direction(state.position, time), member.surface.law
+            noise = rounding(self, member, size, time.dtype)
+            touches = abs(self.level(member, time, state.position, state)) <= 16.0 * noise
+            same = True if law.restitution is mu else law.restitution == mu
+            closes = dot(direction, state.velocity) < 0
+            return known & ((contact.index == member.number) | (touches & closes & same)), direction
 
-        hits = [is_hit_too(i) for i in alike]
-        several = total([where(hit, 1.0, 0.0) for hit in hits]) > 1.5
+        alike = [each for each, is_alike in zip(self.contacts(), one_mu, strict=True) if is_alike]
+        found = [hit_too(each) if isinstance(each, Member) else each[1].each(each[0], hit_too) for each in alike]
+        several = total([jnp.sum(where(hit, 1.0, 0.0)) for hit, _ in found]) > 1.5
 
         def at_corner(_):
-            laws = [self.surfaces[i].law for i in alike]
-            directions = [normals[i] for i in alike]
-            velocity, spin = collide_with_all(
-                self.ball.radius, self.ball.inertia_ratio, laws, directions, hits, mu, state.velocity, state.spin
+            laws = [_law(each.surface if isinstance(each, Member) else each[1]) for each in alike]
+            rows = [_rows(law, *each, time.dtype) for law, each in zip(laws, found, strict=True)]
+            ball = self.ball
+            return as_arrays(
+                collide_with_all(ball.radius, ball.inertia_ratio, jnp.concatenate(rows), mu, state.velocity, state.spin)
             )
-            return as_arrays((velocity, spin))
 
         as_arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=time.dtype), tree)  # noqa: E731
         both = as_arrays((velocity, spin))
@@ -197,7 +225,7 @@ class Scene(AbstractSystem):
         slip = subtract(subtract(velocity, scale(ball.radius, cross(spin, n))), scale(closing, n))
         closing, *slip = shared([closing, *slip])
         sizes = (ball.inertia_ratio, abs(closing), dot(slip, slip))
-        s = contact.of([surface.law.slip_factor(*sizes) for surface in self.surfaces])
+        s = contact.of([surface.law.slip_factor(*sizes) for surface in self.chosen(contact)])
         s, rebound = shared([s, times(plus(1.0, e_n), closing)])
         kick = add(scale(rebound, n), scale(s, slip))
         twist = times(s, ratio(1.0, times(ball.inertia_ratio, ball.radius)))
@@ -243,45 +271,53 @@ class Scene(AbstractSystem):
                 walls.append(Wall(n, gap, dot(n, v), dot(n, half_g), noise, there))
 
         def kicked(choice, position, velocity, spin):
-            choice = Choice(choice, len(self.surfaces))
-            n = choice.vector(self.normals(0.0, position))
+            choice = self.choice(choice)
+            n = self.normal(choice, 0.0, position)
             # Only the slip is shared: each number more is one more pass over the batch.
             return self._after(choice, n, velocity, spin, lambda x: (x[0], *shared(x[1:])) if len(x) > 2 else x)
 
         return walls, g, kicked
 
+    def _surface(self, contact: Any) -> AbstractSurface:
+        return contact.surface if isinstance(contact, Member) else self.surfaces[contact]
+
     def level(self, contact, time, q, state):
-        return self.surfaces[contact].level(q, time, self.ball.radius)
+        return self._surface(contact).level(q, time, self.ball.radius)
 
     def is_parabolic(self, contact):
-        return self.surfaces[contact].is_parabolic
+        return self._surface(contact).is_parabolic
 
     def returns(self, contact, time, q, v, half_a):
-        law = self.surfaces[contact].law  # elastic bounces stay high
-        elastic = is_constant(law.restitution) and law.restitution == 1
-        return None if elastic else self.surfaces[contact].returns(q, v, half_a, time)
+        surface = self._surface(contact)
+        elastic = is_constant(surface.law.restitution) and surface.law.restitution == 1  # such bounces stay high
+        return None if elastic else surface.returns(q, v, half_a, time)
 
     def reach(self, contact, q):
-        return self.surfaces[contact].reach(q, self.ball.radius)
+        return self._surface(contact).reach(q, self.ball.radius)
 
     def bend(self, contact, time, window: Window, state):
-        return self.surfaces[contact].bend(window, time, self.ball.radius)
+        return self._surface(contact).bend(window, time, self.ball.radius)
 
     def is_bounded(self, contact):
-        return self.surfaces[contact].is_bounded()
+        return self._surface(contact).is_bounded()
 
     def extent(self, contact):
-        return plus(self.surfaces[contact].extent(), self.ball.radius)
+        return plus(self._surface(contact).extent(), self.ball.radius)
 
     def is_admissible(self, time, state):
         leaves = [leaf for leaf in jax.tree.leaves((self, state)) if not is_constant(leaf)]
         holds: list = [jnp.all(jnp.isfinite(leaf)) for leaf in leaves]
         holds += [value > 0 for value in (self.ball.radius, self.ball.mass, self.ball.inertia_ratio)]
         size = magnitude(state.position)
-        for i, surface in enumerate(self.surfaces):
-            holds += [check for check, _ in (*surface.is_proper(self.ball.radius), *surface.law.admissible())]
-            depth = self.level(i, time, state.position, state) + 16.0 * rounding(self, i, size, time.dtype)
-            holds.append(depth >= 0)
+
+        def fits(member: Member) -> Any:
+            surface = member.surface
+            checks = [check for check, _ in (*surface.is_proper(self.ball.radius), *surface.law.admissible())]
+            depth = self.level(member, time, state.position, state) + 16.0 * rounding(self, member, size, time.dtype)
+            return functools.reduce(jnp.logical_and, [x for x in checks if x is not True], depth >= 0)
+
+        for each in self.contacts():
+            holds.append(fits(each) if isinstance(each, Member) else jnp.all(each[1].each(each[0], fits)))
         return functools.reduce(jnp.logical_and, [x for x in holds if x is not True], jnp.asarray(True))
 
     def received(self, state, batch, t0):
@@ -301,10 +337,22 @@ class Scene(AbstractSystem):
         return BallState(parts[0], parts[1], parts[2], state.orientation)
 
     def contact_frame(self, contact, time, state: Flight):
-        n = contact.vector(self.normals(time, state.position))
+        n = self.normal(contact, time, state.position)
         n = tuple(jnp.asarray(c, dtype=time.dtype) for c in n)
         point = subtract(state.position, scale(self.ball.radius, n))
         return jnp.stack(point), jnp.stack(n)
 
     def without_contacts(self) -> "Scene":
         return Scene(self.ball, {}, self.gravity, self.air)
+
+
+def _law(surface: AbstractSurface | Stack) -> AbstractContactLaw:
+    return surface.surface.law if isinstance(surface, Stack) else surface.law
+
+
+def _rows(law: AbstractContactLaw, hit: Any, normal: Vector3, dtype: Any) -> Any:
+    """`rows_of` one surface, or of all that are in a stack."""
+    if jnp.ndim(hit) == 0:
+        return rows_of(law, normal, hit, dtype)
+    normal = tuple(jnp.broadcast_to(jnp.asarray(c, dtype), hit.shape) for c in normal)
+    return jax.vmap(lambda n, flag: rows_of(law, n, flag, dtype))(normal, hit).reshape(-1, 6)

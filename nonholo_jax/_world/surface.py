@@ -58,6 +58,7 @@ class AbstractSurface(eqx.Module):
     law: eqx.AbstractVar[AbstractContactLaw]
     has_edges: ClassVar[bool] = False  # whether its flat faces, if there are any, end somewhere
     is_parabolic: ClassVar[bool] = False  # whether the level along every parabola is one itself
+    few: ClassVar[int] = 4  # up to how many in a row a program holds one by one
 
     def __check_init__(self):
         if not isinstance(self.law, AbstractContactLaw):
@@ -156,6 +157,7 @@ class Plane(AbstractSurface):
     facing: Any = eqx.field(converter=as_vector)
     law: AbstractContactLaw
     is_parabolic: ClassVar[bool] = True
+    few: ClassVar[int] = 8
 
     def __init__(self, point: Any, normal: Any, law: AbstractContactLaw):
         self.point, self.facing, self.law = as_vector(point), as_vector(normal), law

@@ -8,8 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from .._math import KINDS, RESULTS, Choice, Index, Interval, Number, Scalar, Window, plus, times, total
-from .hops import Hopper
+from .._math import KINDS, RESULTS, Choice, Hopper, Index, Interval, Number, Scalar, Window, plus, times, total
 from .surface import Return
 
 
@@ -28,8 +27,21 @@ class AbstractSystem(eqx.Module):
     see, are tuples of scalars. A contact is crossed where its `level` goes from positive to negative: a smooth
     function with the zeros of the gap, and its derivative there, that is cheaper to bound than the gap itself."""
 
-    n_contacts: eqx.AbstractVar[int]
+    n_contacts: eqx.AbstractVar[int]  # a contact is its number, or a `Member`
     is_long: eqx.AbstractClassVar[bool]  # `derivative` is a long program: a loop should hold it only once
+
+    def engine(self, dtype: Any) -> "AbstractSystem":
+        """The same system as the event loop sees it, where all numbers have that dtype."""
+        del dtype
+        return self
+
+    def contacts(self) -> list:
+        """All contacts; those of one class may stand together, as a pair of their first number and a `Stack`."""
+        return list(range(self.n_contacts))
+
+    def choice(self, index: Any) -> Choice:
+        """The contact of a traced number, with all contacts as `members`."""
+        return Choice(index, self.n_contacts, members=range(self.n_contacts))
 
     @abstractmethod
     def evolving(self, state: Any) -> tuple[tuple[Number, ...], tuple[Number, ...]]:
@@ -79,33 +91,33 @@ class AbstractSystem(eqx.Module):
         """Which motion a state is in: -1 if free, else the index of the contact that it stays on."""
 
     @abstractmethod
-    def level(self, contact: int, time: Scalar, q: tuple, state: Any) -> Number:
+    def level(self, contact: Any, time: Scalar, q: tuple, state: Any) -> Number:
         """Positive apart, zero at contact, negative beyond; there its derivative is that of the gap in metres. `state`
         is the one at which the arc began."""
 
     @abstractmethod
-    def is_parabolic(self, contact: int) -> bool:
+    def is_parabolic(self, contact: Any) -> bool:
         """Whether the level along every parabola is one itself: `bend` is then exact over the whole arc."""
 
     @abstractmethod
-    def returns(self, contact: int, time: Scalar, q: tuple, v: tuple, half_a: tuple) -> Return | None:
+    def returns(self, contact: Any, time: Scalar, q: tuple, v: tuple, half_a: tuple) -> Return | None:
         """When a parabola that begins on a flat face of a surface comes back to it, if low bounces on it are to be
         exact, else `None`."""
 
     @abstractmethod
-    def reach(self, contact: int, q: tuple) -> Number | None:
+    def reach(self, contact: Any, q: tuple) -> Number | None:
         """A length over which `bend` is worth asking for; `None` if there is no such length."""
 
     @abstractmethod
-    def bend(self, contact: int, time: Scalar, window: Window, state: Any) -> Interval:
+    def bend(self, contact: Any, time: Scalar, window: Window, state: Any) -> Interval:
         """Bounds of the second derivative of the level along the window."""
 
     @abstractmethod
-    def is_bounded(self, contact: int) -> bool:
+    def is_bounded(self, contact: Any) -> bool:
         """Whether `bend` is a true bound, not an estimate from samples."""
 
     @abstractmethod
-    def extent(self, contact: int) -> Number:
+    def extent(self, contact: Any) -> Number:
         """The size of the numbers that the level is computed from, in metres: it sets the rounding error."""
 
     @abstractmethod
@@ -150,6 +162,6 @@ def magnitude(q: Sequence[Number]) -> Number:
     return total([abs(c) for c in q])
 
 
-def rounding(system: AbstractSystem, contact: int, size: Number, dtype: Any) -> Number:
+def rounding(system: AbstractSystem, contact: Any, size: Number, dtype: Any) -> Number:
     """The rounding error of a level in m: a few eps of the numbers that it is computed from."""
     return times(8.0 * float(jnp.finfo(dtype).eps), plus(size, system.extent(contact)))

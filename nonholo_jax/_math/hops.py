@@ -14,19 +14,9 @@ import equinox.internal as eqxi
 import jax.numpy as jnp
 from jax import lax
 
-from .._math import (
-    Choice,
-    Number,
-    Vector3,
-    add,
-    is_constant,
-    plus,
-    scale,
-    shared,
-    times,
-    total,
-    where,
-)
+from .shared import shared
+from .types import Number, Vector3
+from .vector import Choice, add, is_constant, plus, scale, times, total, where
 
 
 class Hop(NamedTuple):
