@@ -3,6 +3,8 @@ long."""
 
 import ast
 import pathlib
+import subprocess
+import sys
 
 import pytest
 
@@ -11,19 +13,19 @@ import nonholo_jax
 PACKAGE = pathlib.Path(nonholo_jax.__file__).parent
 # From the ground up, and so in each room.
 ROOMS = {
-    "_math": ["types", "vector", "shared", "polynomial", "gap", "rotation", "tiles", "tangents"],
+    "_math": ["types", "vector", "shared", "hops", "polynomial", "gap", "rotation", "tiles", "tangents"],
     "_impact": ["projector", "law", "corner", "train", "rolling"],
     "_world": [
-        "hops",
-        "system",
-        "checks",
         "ball",
         "surface",
         "box",
         "round",
         "air",
+        "stack",
+        "system",
+        "checks",
         "scene",
-        "floors",
+        "settling",
         "grounded",
         "lagrangian",
     ],
@@ -113,8 +115,33 @@ def test_imports_only_from_above(file):
 
 @pytest.mark.parametrize("name", ["__init__", *DOORS])
 def test_doors_only_hand_on(name):
+    """The package's own door may hand on rooms when they are asked for, too."""
     document, *rest = parsed(PACKAGE / f"{name}.py").body
-    assert isinstance(document, ast.Expr) and all(isinstance(node, ast.ImportFrom) for node in rest)
+    assert isinstance(document, ast.Expr)
+    defined = {getattr(node, "name", ast.unparse(node).split(" ")[0])
+               for node in rest if not isinstance(node, ast.Import | ast.ImportFrom | ast.If)}  # fmt: skip
+    assert defined <= ({"_WHEN_ASKED", "__getattr__", "__dir__", "__all__"} if name == "__init__" else set())
+
+
+def test_what_is_handed_on_when_asked_for_is_what_type_checkers_see():
+    block = next(node for node in parsed(PACKAGE / "__init__.py").body if isinstance(node, ast.If))
+    imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
+    seen = {node.module: sorted(alias.name for alias in node.names) for node in imports}
+    assert seen == {room: sorted(names) for room, names in nonholo_jax._WHEN_ASKED.items()}
+
+
+def test_a_plain_simulation_needs_no_question_and_no_ensemble():
+    code = """
+import sys
+from nonholo_jax import Ball, BallState, Plane, Rough, Scene, simulate
+scene = Scene(Ball(0.025, 0.046), {"floor": Plane((0, 0, 0), (0, 0, 1), Rough())})
+simulate(scene, BallState([0, 0, 1], [1, 0, 0], [0, 0, 0]), t1=0.1)
+heavy = "matplotlib pydantic zarr pyarrow SALib xarray pandas scipy.optimize optax tqdm".split()
+rooms = [f"nonholo_jax.{room}" for room in ("_questions", "_ensembles", "_files", "_pictures")]
+print([name for name in (*heavy, *rooms) if name in sys.modules])
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]", found.stdout
 
 
 @files

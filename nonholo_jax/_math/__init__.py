@@ -29,6 +29,7 @@ from .tiles import (
     by_tiles as by_tiles,
     free_devices as free_devices,
     in_tiles as in_tiles,
+    on_cpu as on_cpu,
     over_devices as over_devices,
     unless_batched as unless_batched,
     where_needed as where_needed,

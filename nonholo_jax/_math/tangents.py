@@ -165,10 +165,10 @@ def tangent_of(
         return list(jax.vjp(lambda *moving: plain(residuals, moving), *at)[1](list(numbers)))
 
     shapes = [tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in xs) for xs in (jax.tree.leaves(like), along)]
-    both = lambda function: [functools.partial(function, each) for each in (iteration, many)]  # noqa: E731
+    of = functools.partial
     ways = {
-        "forward": _Linear(shapes[0], *both(forward), plain_forward),
-        "backward": _Linear(shapes[1], *both(backward), plain_backward),
+        "forward": _Linear(shapes[0], of(forward, iteration), of(forward, many), plain_forward),
+        "backward": _Linear(shapes[1], of(backward, iteration), of(backward, many), plain_backward),
     }
     out = _linear.bind(*arrays, *along, n_residuals=len(arrays), tile=tile, **ways)
     return jax.tree.unflatten(jax.tree.structure(like), out)

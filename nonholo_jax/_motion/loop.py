@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._math import ENDS, FULL, KINDS, PAUSES, RESULTS, Hopper, frozen, norm, shared, total, where
+from .._math import ENDS, FULL, KINDS, PAUSES, RESULTS, Hopper, frozen, norm, on_cpu, shared, total, where
 from .._world import AbstractSystem, Meeting
 from .crossing import crossing_time, search
 from .motion import AbstractMotion
@@ -187,7 +187,7 @@ def _write(buffer: Any, index: Any, wanted: Any, value: Any) -> Any:
     rows = buffer.shape[0]
     if rows == 0:
         return buffer
-    if rows <= _FEW_ROWS and jax.default_backend() == "cpu" and jax.__version_info__ >= (0, 12):
+    if rows <= _FEW_ROWS and on_cpu() and jax.__version_info__ >= (0, 12):
         (value,) = shared([value]) if jnp.issubdtype(value.dtype, jnp.inexact) else (value,)
         here = jnp.arange(rows, dtype=jnp.int32) == jnp.where(wanted, index, -1)
         return jnp.where(here[:, None], value[None], buffer)
@@ -239,6 +239,15 @@ def start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> Carry
     )
 
 
+def _followed(c: Carry, ended: Any, sizes: tuple, contact: Any, kind: Any, flags: Flags) -> Path:
+    """The path with one more arc, where there is room for one."""
+    if c.path.labels.shape[0] == 0:
+        return c.path
+    begun = Begun(c.time, c.state, c.memory, c.since)
+    row = _path_row(contact, kind, flags, c.n_impacts, jnp.stack(sizes), begun)
+    return _written(c.path, c.n_arcs % c.path.labels.shape[0], ended, *row)
+
+
 def turn(
     c: Carry, system: AbstractSystem, motion: AbstractMotion, t1: Any, max_impacts: int, differentiable: bool = False
 ) -> Carry:
@@ -284,15 +293,10 @@ def turn(
     stopped, crossed = _shared_flags((stopped, crossed))
     struck = crossed & ~stopped
     until, settled = time + met.pause, struck & met.is_at_rest
-    row, labels = Row(time, until, since, arrived, after), jnp.stack([name, _code(met.kind), system.phase(after)])
-    log = _written(c.log, c.n_impacts, struck, pack_row(row), labels)
-    path = c.path
-    if path.labels.shape[0] > 0:
-        flags = Flags(c.jumped, struck, reached)
-        sizes = jnp.stack([where(last, jnp.inf, length), s, c.ahead])
-        begun = Begun(c.time, c.state, c.memory, c.since)
-        filled = _path_row(found.contact, labels[1], flags, c.n_impacts, sizes, begun)
-        path = _written(path, c.n_arcs % path.labels.shape[0], ended, *filled)
+    row, kind = Row(time, until, since, arrived, after), _code(met.kind)
+    log = _written(c.log, c.n_impacts, struck, pack_row(row), jnp.stack([name, kind, system.phase(after)]))
+    sizes = where(last, jnp.inf, length), s, c.ahead
+    path = _followed(c, ended, sizes, found.contact, kind, Flags(c.jumped, struck, reached))
 
     broken = ended & ~jnp.isfinite(total([time, *jax.tree.leaves(jax.tree.map(jnp.sum, arrived))]))
     (broken,) = _shared_flags((broken,))

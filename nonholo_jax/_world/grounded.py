@@ -29,7 +29,7 @@ from .._math import (
 )
 from .round import round_bend, round_level
 from .scene import Scene
-from .settling import Floors, Ground, Settling, Travel
+from .settling import Floors, Ground, Settling, Travel, phase_of
 from .stack import Member
 from .system import AbstractSystem, Meeting, bounces
 
@@ -149,7 +149,7 @@ class Grounded(AbstractSystem):
     # Contacts
 
     def phase(self, state):
-        return jnp.asarray(state.support).astype(jnp.int32)
+        return phase_of(state)
 
     def named(self, contact, state):
         return where(contact.index >= self._n_surfaces, self.phase(state), contact.index)
@@ -224,9 +224,8 @@ class Grounded(AbstractSystem):
             return _as_arrays(bounces(ends, Travel(struck, -1.0)), time)
 
         def unusual() -> Meeting:
-            return _as_arrays(
-                settling.meets(settling.touch(contact, time, state, n, struck, pull), left, rests, ends), time
-            )
+            touch = settling.touch(contact, time, state, n, struck, pull)
+            return _as_arrays(settling.meets(touch, left, rests, ends), time)
 
         return _if_any((state.support >= 0) | soon, unusual, plain)
 

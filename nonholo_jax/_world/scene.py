@@ -206,7 +206,7 @@ class Scene(AbstractSystem):
 
         def at_corner(_):
             laws = [_law(each.surface if isinstance(each, Member) else each[1]) for each in alike]
-            rows = [_rows(law, *each, time.dtype) for law, each in zip(laws, found, strict=True)]
+            rows = [_rows(law, hit, normal, time.dtype) for law, (hit, normal) in zip(laws, found, strict=True)]
             ball = self.ball
             return as_arrays(
                 collide_with_all(ball.radius, ball.inertia_ratio, jnp.concatenate(rows), mu, state.velocity, state.spin)
@@ -354,5 +354,5 @@ def _rows(law: AbstractContactLaw, hit: Any, normal: Vector3, dtype: Any) -> Any
     """`rows_of` one surface, or of all that are in a stack."""
     if jnp.ndim(hit) == 0:
         return rows_of(law, normal, hit, dtype)
-    normal = tuple(jnp.broadcast_to(jnp.asarray(c, dtype), hit.shape) for c in normal)
-    return jax.vmap(lambda n, flag: rows_of(law, n, flag, dtype))(normal, hit).reshape(-1, 6)
+    each = jnp.stack([jnp.broadcast_to(jnp.asarray(c, dtype), hit.shape) for c in normal], axis=-1)
+    return jax.vmap(lambda n, flag: rows_of(law, components(n), flag, dtype))(each, hit).reshape(-1, 6)

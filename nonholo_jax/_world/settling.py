@@ -133,6 +133,10 @@ class Travel(NamedTuple):
     below: Ground | None = None  # only while an arc is worked on
 
 
+def phase_of(state: Travel) -> Any:
+    return jnp.asarray(state.support).astype(jnp.int32)
+
+
 class Touch(NamedTuple):
     """A ball that crosses a contact, and what is below it: the face that it is on, or else that of the surface that it
     hits."""
@@ -173,7 +177,7 @@ class Settling(NamedTuple):
 
     def ground(self, time: Any, state: Travel) -> Ground:
         flight, floors, on = state.flight, self.floors, state.support >= 0
-        support = self.scene.choice(self.phase(state))
+        support = self.scene.choice(phase_of(state))
         face, edged = floors.face(support, flight.position, time)
         edged, rolls, ball, n = on & edged, on & floors.rolls(support), self.scene.ball, face.normal
         share = where(rolls, ratio(1.0, 1.0 + ball.inertia_ratio), 1.0)
@@ -199,7 +203,7 @@ class Settling(NamedTuple):
 
     def touch(self, contact: Choice, time: Any, state: Travel, n: Vector3, struck: Flight, pull: Vector3) -> Touch:
         floors = self.floors
-        floor = self.scene.choice(where(state.support >= 0, self.phase(state), contact.index))
+        floor = self.scene.choice(where(state.support >= 0, phase_of(state), contact.index))
         face, edged = floors.face(floor, state.flight.position, time)
         first = train.start(struck.velocity, struck.spin, face.normal, pull, self.scene.ball.radius)
         law = floors.law(floor)
