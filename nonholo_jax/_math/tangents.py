@@ -277,7 +277,7 @@ def _pulled(iteration: Iteration, hint: Any, arguments: Callable, at: list, cota
     zero = jnp.zeros_like(parts)
     first = _Pull(zero, stays, parts - 1, kept, cotangent, sums, iteration.finished(stays))
     if iteration.most == 1:
-        last = job(first._replace(goal=zero))
+        last = lax.cond(parts > 0, job, lambda c: c, first._replace(goal=zero))
         last = last._replace(finished=iteration.finished(last.stays))
     else:
         last = lax.while_loop(lambda c: c.goal >= 0, job, first)

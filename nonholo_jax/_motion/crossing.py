@@ -60,23 +60,14 @@ class Arc(eqx.Module):
 
 
 class Search(NamedTuple):
-    """How far the search has come along an arc, and, where a contact is crossed, what its level does there."""
+    """How far the search has come along an arc."""
 
     s: Scalar  # local time up to which no contact is crossed
     window: Scalar  # how far ahead the next step looks for its bound
     contact: Index  # the contact that is crossed at s, or -1
     finished: Bool[Array, ""]  # a contact is crossed or the end of the arc is reached
-    rate: Scalar  # of the level there
-    bend: Scalar  # a lower bound of its second derivative
-    noise: Scalar  # the rounding error of the level
-    exact: Bool[Array, ""]  # the level is a parabola, so that a bounce of any height is computed
-
-    def rests(self, speed: Any) -> tuple[Any, Any]:
-        """Whether a bounce would not rise above rounding, and whether it could not even be computed: on a plane it is,
-        down to the rounding of the velocity itself."""
-        rests = (self.bend < 0) & (self.rate * self.rate <= -2.0 * self.bend * self.noise)
-        least = 16.0 * float(jnp.finfo(self.s.dtype).eps) * speed
-        return rests, rests & (~self.exact | (jnp.abs(self.rate) <= least))
+    rests: Bool[Array, ""]  # a bounce there would not rise above rounding
+    ends: Bool[Array, ""]  # nor could it be computed: the motion stays in contact
 
 
 class _Step(NamedTuple):
@@ -220,18 +211,26 @@ def search(system: AbstractSystem, arc: Arc, start: Any, window: Any, touching: 
         end = s + first.size
         hit = first.hit & (end <= arc.length)
         ahead = where(first.clear, 4.0, 2.0) * jnp.minimum(first.size, arc.length)
-        rate = first.rate + first.bend * where(hit, first.size, 0.0)
-        rate, bend, noise = (jnp.asarray(x, s.dtype) for x in (rate, first.bend, first.noise))
+        rests, ends = _rests(first, hit, here.speed, s.dtype)
         s, finished = jnp.minimum(end, arc.length), hit | (end >= arc.length)
-        found = Search(s, ahead, where(hit, contact, none), finished, rate, bend, noise, jnp.asarray(first.exact))
+        found = Search(s, ahead, where(hit, contact, none), finished, rests, ends)
         return Search(*[where(state.finished, a, b) for a, b in zip(state, found, strict=True)])
 
-    none, zero = jnp.asarray(-1, dtype=jnp.int32), jnp.zeros_like(start)
-    state = Search(start, window, none, start >= arc.length, zero, zero, zero, jnp.asarray(False))
+    none, no = jnp.asarray(-1, dtype=jnp.int32), jnp.asarray(False)
+    state = Search(start, window, none, start >= arc.length, no, no)
     if n_steps == 1 or system.n_contacts == 0:
         return step(state)
     going = lambda c: (c[0] < n_steps) & eqxi.unvmap_any(~c[1].finished)  # noqa: E731
     return lax.while_loop(going, lambda c: (c[0] + 1, step(c[1])), (jnp.asarray(0), state))[1]
+
+
+def _rests(first: _Step, hit: Any, speed: Number, dtype: Any) -> tuple[Any, Any]:
+    """Whether a bounce at the end of a step would not rise above rounding, and whether it could not even be computed:
+    on a plane it is, down to the rounding of the velocity itself."""
+    rate = first.rate + first.bend * where(hit, first.size, 0.0)
+    rests = jnp.asarray(first.bend < 0) & (rate * rate <= -2.0 * first.bend * first.noise)
+    least = 16.0 * float(jnp.finfo(dtype).eps) * speed
+    return rests, rests & (jnp.logical_not(first.exact) | (abs(rate) <= least))
 
 
 _NOTHING = (0.0, 0.0, 0.0, False)  # of a level that is never zero

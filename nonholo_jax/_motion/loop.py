@@ -286,7 +286,7 @@ def turn(
     met, name = Meeting(KINDS.unused, RESULTS.reached_t1, arrived, 0.0, False), found.contact
     if system.n_contacts > 0:
         name = system.named(contact, arrived)
-        met = system.meets(contact, time, arrived, t1 - time, *found.rests(speed))
+        met = system.meets(contact, time, arrived, t1 - time, found.rests, found.ends)
     after = as_arrays(met.after, t1.dtype)
     failed = met.fault != RESULTS.reached_t1
     stopped = crossed & (failed | full | stuck)
