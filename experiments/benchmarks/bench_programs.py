@@ -202,7 +202,8 @@ def second(gradient: bool) -> dict:
 
 def design() -> dict:
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "nonholo_jax.cli", "design"]
+        start = "import sys; from nonholo_jax.cli import main; sys.exit(main())"
+        command = [sys.executable, "-c", start, "design"]
         command += [str(ROOT / "experiments/scenes/under_the_table.toml"), "--out", folder, "--json"]
         environment = {**os.environ, "NONHOLO_CACHE": "off"}
         begun = time.perf_counter()

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import diffrax
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -103,6 +104,8 @@ class Integrated(AbstractMotion):
 
     def check(self, system):
         del system
+        if isinstance(self.solver, diffrax.AbstractERK):
+            interpolation_weights(self.solver)  # here, since within a transformation it takes many small programs
 
     def max_pieces(self, max_impacts):
         return self.max_steps
@@ -266,14 +269,16 @@ def _weights(interpolation: Any, b_sol: tuple, dtype: Any) -> np.ndarray:
     nodes = [0.5 - 0.5 * np.cos(np.pi * (np.arange(degree) + 1) / degree) for degree in range(1, _HIGHEST + 1)]
     points = [*nodes, np.linspace(0.0, 1.0, 23)]  # 0 is known: the path starts there
 
-    @jax.jit  # one program for all
-    def evaluate(times: Any) -> Any:
+    def evaluate(times: Any) -> Any:  # one program for all
         ends = {"t0": jnp.zeros((), dtype), "t1": jnp.ones((), dtype), "y0": jnp.zeros(n, dtype)}
         path = interpolation(**ends, y1=jnp.asarray(b_sol, dtype), k=jnp.eye(n, dtype=dtype))
         return jax.vmap(path.evaluate)(times)
 
-    with jax.ensure_compile_time_eval():
-        found = evaluate(np.concatenate(points).astype(dtype))
+    times = np.concatenate(points).astype(dtype)
+    found = jax.jit(evaluate)(times)
+    if isinstance(found, jax.core.Tracer):
+        with jax.ensure_compile_time_eval():  # within somebody's transformation; then in many small programs
+            found = evaluate(times)
     *samples, values = np.split(np.asarray(found, dtype=float), np.cumsum([len(x) for x in points])[:-1])
     eps = float(jnp.finfo(dtype).eps)
     for degree, (at, sample) in enumerate(zip(nodes, samples, strict=True), 1):

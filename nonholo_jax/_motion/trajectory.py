@@ -141,27 +141,7 @@ def _in_train(trajectory: Trajectory, past: Any, n: Any, t: Any) -> tuple[Any, A
 
 def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any, outcome: Outcome) -> Trajectory:
     """The user's form of an outcome."""
-    values = outcome.log.values
-    contact, code, support = (outcome.log.labels[:, i] for i in range(3))
-    row = unpack_row(values, outcome.state)
-    used = contact >= 0
-    safe = jax.tree.map(jnp.nan_to_num, frozen(outcome.state))  # harmless numbers for the rows that are not used
-    before = jax.tree.map(lambda a, b: jnp.where(along(used, a), a, b), row.before, safe)
-    if system.n_contacts > 0:
-        frame = lambda i, *rest: system.contact_frame(system.choice(i), *rest)  # noqa: E731
-        point, normal = jax.vmap(frame)(contact, row.time, before)
-        point, normal = (jnp.where(used[:, None], x, jnp.nan) for x in (point, normal))
-    else:
-        point = normal = jnp.full((contact.shape[0], len(system.evolving(outcome.state)[0])), jnp.nan, t0.dtype)
-    packed_before, packed_after = jax.vmap(system.packed)(row.before), jax.vmap(system.packed)(row.after)
-    rate = frozen(jax.vmap(lambda time, state: _rate(system, time, state))(row.time, before))
-    rate = rate[:, : normal.shape[1]]  # of what the normal is of: a state may evolve more than the gaps see
-    closing, speed = jnp.abs(jnp.sum(normal * rate, axis=-1)), jnp.sqrt(jnp.sum(rate**2, axis=-1))
-    grazing = used & (closing <= float(jnp.finfo(t0.dtype).eps) ** 0.5 * speed)
-    log = ImpactLog(
-        row.time, row.until, row.duration, contact, point, normal, packed_before, packed_after,
-        kind_of(jnp.maximum(code, 0)), support, grazing,
-    )  # fmt: skip
+    log = _log(system, t0, outcome)
     return Trajectory(
         final=system.packed(outcome.state),
         t1=outcome.time,
@@ -176,10 +156,39 @@ def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any
     )
 
 
-def _rate(system: AbstractSystem, time: Any, state: Any) -> Any:
-    """dq/dt of one state."""
-    rate, _ = system.derivative(time, state, *system.evolving(state))
-    return jnp.stack([jnp.asarray(x, dtype=time.dtype) for x in rate])
+def _log(system: AbstractSystem, t0: Any, outcome: Outcome) -> ImpactLog:
+    values = outcome.log.values
+    contact, code, support = (outcome.log.labels[:, i] for i in range(3))
+    row, used = unpack_row(values, outcome.state), contact >= 0
+    safe = jax.tree.map(jnp.nan_to_num, frozen(outcome.state))  # harmless numbers for the rows that are not used
+    before = jax.tree.map(lambda a, b: jnp.where(along(used, a), a, b), row.before, safe)
+
+    def frames(contact: Any, time: Any, before: Any) -> tuple:
+        if system.n_contacts == 0:
+            nowhere = jnp.full((contact.shape[0], len(system.evolving(outcome.state)[0])), jnp.nan, t0.dtype)
+            return nowhere, nowhere, jnp.zeros(contact.shape, bool)
+        frame = lambda i, *rest: system.contact_frame(system.choice(i), *rest)  # noqa: E731
+        point, normal = jax.vmap(frame)(contact, time, before)
+        point, normal = (jnp.where(used[:, None], x, jnp.nan) for x in (point, normal))
+        rate = frozen(jax.vmap(lambda time, state: _joined(system.rate_of(time, state), time))(time, before))
+        rate = rate[:, : normal.shape[1]]  # of what the normal is of: a state may evolve more than the gaps see
+        closing, speed = jnp.abs(jnp.sum(normal * rate, axis=-1)), jnp.sqrt(jnp.sum(rate**2, axis=-1))
+        return point, normal, used & (closing <= float(jnp.finfo(t0.dtype).eps) ** 0.5 * speed)
+
+    if values.shape[0] > 0:
+        point, normal, grazing = frames(contact, row.time, before)
+    else:  # nothing to compute, only shapes to know
+        shapes = jax.eval_shape(frames, contact, row.time, before)
+        point, normal, grazing = (jnp.zeros(x.shape, x.dtype) for x in shapes)
+    packed_before, packed_after = jax.vmap(system.packed)(row.before), jax.vmap(system.packed)(row.after)
+    return ImpactLog(
+        row.time, row.until, row.duration, contact, point, normal, packed_before, packed_after,
+        kind_of(jnp.maximum(code, 0)), support, grazing,
+    )  # fmt: skip
+
+
+def _joined(numbers: Any, like: Any) -> Any:
+    return jnp.stack([jnp.asarray(x, dtype=like.dtype) for x in numbers])
 
 
 def flat(measures: Iterable[Any], trajectory: Trajectory) -> Float[Array, " q"]:

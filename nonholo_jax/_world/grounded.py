@@ -122,6 +122,9 @@ class Grounded(AbstractSystem):
         with_slip = scale(free.share, add(rate, scale(self.scene.ball.inertia_ratio, changes)))
         return (*v, *changes), where_vector(below.rolls, with_slip, scale(free.share, rate))
 
+    def rate_of(self, time, state):
+        return state.flight.velocity
+
     def _slip_rate(self, below: Ground, slip: Vector3, along: Vector3, push: Number) -> Vector3:
         """The rate of the slip, zero for a ball that does not slide against friction."""
         slides, heading = dot(below.heading, below.heading) > 0, below.heading

@@ -128,6 +128,9 @@ class Scene(AbstractSystem):
         g = components(self.gravity)
         return v, g if self.air is None else add(g, self.air.acceleration(self.ball, v, state.spin))
 
+    def rate_of(self, time, state):
+        return state.velocity
+
     def advanced(self, time, state, q, v, duration):
         orientation = state.orientation
         if orientation is not None:  # the spin is constant in flight, so that the rotation is exact
@@ -182,7 +185,8 @@ class Scene(AbstractSystem):
     def struck(self, contact: Choice, time: Any, state: Flight) -> tuple[Vector3, Flight]:
         """The normal of a contact, and the state after an impact there: by Theorem 5.2, for any normal and any law; at
         a corner by (4.2), for all that is hit if that has one mu."""
-        n = shared(self.normal(contact, time, state.position))
+        normals = [surface.direction(state.position, time) for surface in self.chosen(contact)]
+        n = shared(contact.vector(normals))
         velocity, spin = self._after(contact, n, state.velocity, state.spin)
         one_mu = [is_one_mu(_law(each)) for each in self.surfaces]
         if sum(size for size, alike in zip(self._sizes, one_mu, strict=True) if alike) < 2:
@@ -190,18 +194,20 @@ class Scene(AbstractSystem):
         known = contact.among([i for i, alike in enumerate(one_mu) if alike])
         mu, size = self.restitution(contact), magnitude(state.position)
 
-        def hit_too(member: Member) -> tuple:
+        def hit_too(member: Member, direction: Vector3 | None = None) -> tuple:
             """Whether a surface is touched and closed in on when another one is hit that has the same mu, and its
             normal."""
-            direction, law = member.surface.direction(state.position, time), member.surface.law
+            direction, law = direction or member.surface.direction(state.position, time), member.surface.law
             noise = rounding(self, member, size, time.dtype)
             touches = abs(self.level(member, time, state.position, state)) <= 16.0 * noise
             same = True if law.restitution is mu else law.restitution == mu
             closes = dot(direction, state.velocity) < 0
             return known & ((contact.index == member.number) | (touches & closes & same)), direction
 
-        alike = [each for each, is_alike in zip(self.contacts(), one_mu, strict=True) if is_alike]
-        found = [hit_too(each) if isinstance(each, Member) else each[1].each(each[0], hit_too) for each in alike]
+        every = zip(self.contacts(), normals, one_mu, strict=True)
+        alike, own = zip(*[(each, normal) for each, normal, is_alike in every if is_alike], strict=True)
+        found = [hit_too(each, normal) if isinstance(each, Member) else each[1].each(each[0], hit_too)
+                 for each, normal in zip(alike, own, strict=True)]  # fmt: skip
         several = total([jnp.sum(where(hit, 1.0, 0.0)) for hit, _ in found]) > 1.5
 
         def at_corner(_):

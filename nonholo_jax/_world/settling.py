@@ -236,7 +236,7 @@ class Settling(NamedTuple):
             room = minimum(room, clear(each) if isinstance(each, Member) else jnp.min(each[1].each(each[0], clear)))
         return room
 
-    def _sums(self, touch: Touch, end: train.End) -> tuple[Any, Any, Any]:
+    def _sums(self, touch: Touch) -> tuple[Any, Any, Any]:
         """How long the train lasts, whether it is clear of other surfaces and of edges until it ends, and whether it
         has a sum: air changes nothing, and all impacts are of one kind."""
         first, struck = touch.first, touch.struck
@@ -246,6 +246,7 @@ class Settling(NamedTuple):
         clear = train.span(first, lasts_known) + height < self._room(touch)
         calm: Any = True
         if self.scene.air is not None:  # its force now is part of the sum; what matters is how that changes
+            end = train.summed(first, touch.law, touch.slips)
             later = self.pull(touch.time, struck._replace(velocity=end.velocity, spin=end.spin))
             calm = norm(subtract(touch.pull, later)) * lasts_known <= self.tolerance
         if struck.orientation is not None:  # infinitely many rotations have no sum
@@ -271,7 +272,7 @@ class Settling(NamedTuple):
         contact, on, first, law = touch.contact, touch.on, touch.first, touch.law
         is_exit, grips = contact.index >= self.scene.n_contacts, contact.index == self.end_of_slip
         is_floor = self.floors.include(contact) & touch.face.below & (first.pull > 0)
-        lasts, clear, sums = self._sums(touch, train.summed(first, law, touch.slips))
+        lasts, clear, sums = self._sums(touch)
         capped = law.rolls & jnp.isfinite(jnp.inf if law.friction is None else law.friction)
         small = rests & ~capped  # whatever it is, it is taken for a train
         dies_out = is_floor & (lasts <= left) & (small | (clear & sums))
@@ -398,6 +399,8 @@ class Settling(NamedTuple):
 def slides_across(scene: Scene) -> bool:
     """Whether a ball is known now, not only when the program runs, to meet a slope that it may slide across."""
     if any(isinstance(leaf, jax.core.Tracer) or jnp.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
+        return False
+    if all(surface.law.sliding_friction() is None for surface in scene.surfaces):
         return False
     with jax.ensure_compile_time_eval():  # known numbers, also within a transformation
         return _meets_slope(scene)

@@ -55,6 +55,10 @@ class AbstractSystem(eqx.Module):
     def derivative(self, time: Scalar, state: Any, q: tuple, v: tuple) -> tuple[tuple[Number, ...], tuple[Number, ...]]:
         """The rates of q and of v on the arc that begins at `state`."""
 
+    def rate_of(self, time: Scalar, state: Any) -> tuple[Number, ...]:
+        """The rate of q in a state."""
+        return self.derivative(time, state, *self.evolving(state))[0]
+
     @abstractmethod
     def is_uniform(self) -> bool:
         """Whether on every arc v is the rate of as many q and has a constant rate itself, and other q have a constant
