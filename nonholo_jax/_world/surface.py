@@ -157,7 +157,7 @@ class Plane(AbstractSurface):
     facing: Any = eqx.field(converter=as_vector)
     law: AbstractContactLaw
     is_parabolic: ClassVar[bool] = True
-    few: ClassVar[int] = 8
+    few: ClassVar[int] = 32  # between planes a batch hops, which pays for a longer program
 
     def __init__(self, point: Any, normal: Any, law: AbstractContactLaw):
         self.point, self.facing, self.law = as_vector(point), as_vector(normal), law
