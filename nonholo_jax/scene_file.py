@@ -8,4 +8,5 @@ from ._files import (
     SimulateTask as SimulateTask,
     load_scene as load_scene,
     save_scene as save_scene,
+    traced as traced,
 )

@@ -10,6 +10,8 @@ from jaxtyping import install_import_hook
 if jax.__version_info__ < (0, 11):
     os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}"
 
+os.environ["NONHOLO_CACHE"] = "off"  # no test writes to the cache of whoever runs it
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")

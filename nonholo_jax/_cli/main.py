@@ -1,4 +1,4 @@
-"""The command line: `nonholo VERB SCENE.toml`. Only this file touches JAX's configuration."""
+"""The command line: `nonholo VERB SCENE.toml`. Only this file and `cache.py` touch JAX's configuration."""
 
 import argparse
 import contextlib
@@ -12,6 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
+from .cache import programs_kept
 from .clock import BEGAN, CPU_BEFORE
 from .report import finite, motion_of, state_of, table_of, unit_of
 
@@ -97,6 +98,7 @@ def _parser() -> argparse.ArgumentParser:
         each.add_argument("--json", action="store_true", help="print one JSON object, and nothing else")
         each.add_argument("--out", metavar="DIR", help="folder for what is written (default: nonholo-out/SCENE)")
         each.add_argument("--no-plot", action="store_true", help="draw no picture")
+        each.add_argument("--no-cache", action="store_true", help="keep no compiled programs on disk, and use none")
         if verb not in _IN_BOTH:
             each.add_argument("--float32", action="store_true", help="compute in float32 instead of float64")
         else:
@@ -115,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(options: argparse.Namespace, from_start: bool) -> int:
     began = time.perf_counter()
-    with _precision(options.float32):
+    with _precision(options.float32), contextlib.ExitStack() as stack:
         from .._files import load_scene
 
         whole = CPU_BEFORE + time.perf_counter() - BEGAN
@@ -133,6 +135,9 @@ def _run(options: argparse.Namespace, from_start: bool) -> int:
                 raise _BadInput(f"{options.scene}: {what}; add [{table}] with {example}")
         writes = options.verb in (*_IN_BOTH, "montecarlo") or not options.no_plot
         folder = options.folder = _writable(options) if writes else None
+        # Not where times of compilation are measured, nor by processes that would write side by side.
+        alone = options.verb not in _IN_BOTH and getattr(options, "coordinator", None) is None
+        stack.enter_context(programs_kept(alone and not options.no_cache))
         clock = _CompileClock()
         if sys.stderr.isatty():
             print(f"nonholo: compiling the {options.verb}; this takes most of the time", file=sys.stderr, flush=True)
@@ -286,10 +291,11 @@ def _written(report: dict[str, Any], path: Path) -> None:
 def _simulate(file: Any, options: argparse.Namespace) -> _Answer:
     import jax
 
+    from .._files import traced
     from .._math import is_failure, result_message, result_name
     from .._motion import simulate
 
-    trajectory = simulate(file.scene, file.throw, **file.simulate.arguments, throw=False)
+    trajectory = simulate(traced(file.scene), file.throw, **file.simulate.arguments, throw=False)
     jax.block_until_ready(trajectory.t1)
     result = result_name(trajectory.result)
     report = {"throw": state_of(file.throw), "result": result, **motion_of(file.scene, trajectory)}
@@ -301,13 +307,14 @@ def _simulate(file: Any, options: argparse.Namespace) -> _Answer:
 def _design(file: Any, options: argparse.Namespace) -> _Answer:
     import jax
 
+    from .._files import traced
     from .._math import result_name
     from .._questions import ReturnTo, design
 
     how = file.simulate.arguments
     if how["sum_trains"]:  # where an itinerary counts single bounces, `design` leaves trains out, which compiles faster
         del how["sum_trains"]
-    answer = design(file.scene, file.throw, **file.design.arguments, **how)
+    answer = design(traced(file.scene), file.throw, **file.design.arguments, **how)
     jax.block_until_ready(answer.miss)
     values = [float(x) for x in answer.values]
     reached = int((answer.starts.met & (answer.starts.miss <= answer.tolerance)).sum())

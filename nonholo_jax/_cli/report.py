@@ -28,12 +28,9 @@ def state_of(state: Any) -> dict[str, list[float]]:
 def _energy(scene: Any, state: dict[str, list[float]]) -> float:
     """Kinetic and potential energy in J, of a state as it is reported."""
     ball, v, w = scene.ball, state["velocity"], state["spin"]
-    kinetic = (
-        0.5
-        * ball.mass
-        * (math.fsum(x * x for x in v) + ball.inertia_ratio * ball.radius**2 * math.fsum(x * x for x in w))
-    )
-    return float(kinetic - ball.mass * math.fsum(g * x for g, x in zip(scene.gravity, state["position"], strict=True)))
+    mass, radius, inertia_ratio = (float(x) for x in (ball.mass, ball.radius, ball.inertia_ratio))
+    kinetic = 0.5 * mass * (math.fsum(x * x for x in v) + inertia_ratio * radius**2 * math.fsum(x * x for x in w))
+    return kinetic - mass * math.fsum(float(g) * x for g, x in zip(scene.gravity, state["position"], strict=True))
 
 
 def motion_of(scene: Any, trajectory: Any) -> dict[str, Any]:

@@ -9,3 +9,4 @@ from .scene_file import (
     load_scene as load_scene,
     save_scene as save_scene,
 )
+from .traced import traced as traced

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -400,6 +401,8 @@ def slides_across(scene: Scene) -> bool:
     """Whether a ball is known now, not only when the program runs, to meet a slope that it may slide across."""
     if any(isinstance(leaf, jax.core.Tracer) or jnp.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
         return False
+    # As numbers of Python, on which every operation of JAX would be a program of its own to compile.
+    scene = jax.tree.map(lambda x: float(x) if eqx.is_inexact_array(x) and x.ndim == 0 else x, scene)
     if all(surface.law.sliding_friction() is None for surface in scene.surfaces):
         return False
     with jax.ensure_compile_time_eval():  # known numbers, also within a transformation
