@@ -8,6 +8,7 @@ import jax
 import jax.monitoring
 import pytest
 
+from nonholo_jax._cli import cache as module
 from nonholo_jax._cli.cache import folder_of_programs, programs_kept
 from nonholo_jax.cli import main
 
@@ -34,16 +35,15 @@ HITS: list[str] = []
 
 @pytest.fixture(scope="module", autouse=True)
 def _listening():
+    """From now on: JAX has no public way to stop one listener, and the command line has one of its own."""
     jax.monitoring.register_event_listener(lambda event, **_: HITS.append(event) if "cache_hits" in event else None)
-    yield
-    jax.monitoring.clear_event_listeners()
 
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """The folder named for programs; not yet made."""
     monkeypatch.setenv("NONHOLO_CACHE", str(tmp_path / "programs"))
-    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setattr(module, "_LEAST_SECONDS", 0.0)  # so that what is kept does not depend on the machine
     return tmp_path / "programs"
 
 
@@ -70,15 +70,17 @@ def entries(folder):
 def test_a_second_run_and_one_with_other_numbers_compile_nothing_anew(cache, simulated):
     settings = {name: value for name, value in jax.config.values.items() if "cache" in name}
     first, errors, hits = simulated()
-    assert (errors, hits) == ("", 0) and len(entries(cache)) == 1
+    assert (errors, hits) == ("", 0)
+    kept = len(entries(cache))
+    assert kept >= 1
     again, errors, hits = simulated()
-    assert (errors, hits) == ("", 1) and again["final"] == first["final"]
+    assert (errors, hits) == ("", kept) and again["final"] == first["final"]
     changed = SCENE
     for old, new in (("0.5 }", "0.25 }"), ("0.9]", "0.8]"), ("3.0, 0.0]", "9.0, 1.0]"), ("t1 = 0.5", "t1 = 0.6")):
         assert old in changed
         changed = changed.replace(old, new)
     other, errors, hits = simulated(text=changed)
-    assert (errors, hits) == ("", 1) and other["final"] != first["final"] and len(entries(cache)) == 1
+    assert (errors, hits) == ("", kept) and other["final"] != first["final"] and len(entries(cache)) == kept
     assert settings == {name: value for name, value in jax.config.values.items() if "cache" in name}
 
 
@@ -93,15 +95,15 @@ def test_it_can_be_turned_off(cache, simulated, monkeypatch):
 
 def test_a_broken_entry_costs_one_line_and_is_thrown_away(cache, simulated):
     first, _, _ = simulated()
-    (entry,) = entries(cache)
-    whole = entry.read_bytes()
-    entry.write_bytes(whole[: len(whole) // 2])
+    for entry in entries(cache):
+        whole = entry.read_bytes()
+        entry.write_bytes(whole[: len(whole) // 2])
     again, errors, hits = simulated()
     assert hits == 0 and again["final"] == first["final"]
     assert errors.count("\n") == 1 and "not kept in" in errors and "--no-cache" in errors
     assert not entries(cache)
     simulated()
-    assert entries(cache) and simulated()[1:] == ("", 1)
+    assert entries(cache) and simulated()[1:] == ("", len(entries(cache)))
 
 
 def test_a_folder_that_cannot_be_used_costs_one_line(cache, simulated):

@@ -33,10 +33,13 @@ COMPILED: list[str] = []
 
 @pytest.fixture(scope="module", autouse=True)
 def _listening():
-    heard = lambda event, seconds, **_: COMPILED.append(event) if event.endswith("backend_compile_duration") else None
+    """From now on: JAX has no public way to stop one listener, and the command line has one of its own."""
+
+    def heard(event, seconds, **details):
+        if event == "/jax/core/compile/backend_compile_duration":
+            COMPILED.append(event)
+
     jax.monitoring.register_event_duration_secs_listener(heard)
-    yield
-    jax.monitoring.clear_event_listeners()
 
 
 def room(restitution=0.9, height=0.715, floor=0.8, radius=0.025, wind=0.0):
@@ -75,9 +78,13 @@ def test_what_changes_the_model_stays_a_constant():
     }
     scene = traced(Scene(Ball(1.0, 1.0, 1.0), surfaces, (0.0, 0.0, -9.81), Air(drag=0.0, wind=(1.0, 0.0, 0.0))))
     floor, ice, wall, box = scene.surfaces
-    assert (floor.law.restitution, floor.law.tangential, ice.law.restitution, wall.law.friction) == (1.0, -1.0, 0.0, 0.0)
+    assert (floor.law.restitution, floor.law.tangential) == (1.0, -1.0)
+    assert (ice.law.restitution, wall.law.friction) == (0.0, 0.0)
     assert isinstance(wall.law.restitution, jax.Array) and isinstance(wall.law.tangential, jax.Array)
-    kept = lambda vector: [x if isinstance(x, float) else None for x in vector]
+
+    def kept(vector):
+        return [x if isinstance(x, float) else None for x in vector]
+
     assert kept(floor.facing) == [0.0, None, None] and kept(floor.point) == kept(ice.center) == [None] * 3
     assert kept(scene.gravity) == [0.0, 0.0, None] and kept(wall.axis) == [0.0, 0.0, 1.0]
     assert kept(box.rotation) == [None, 0.0, None, 0.0] and kept(box.half_size) == [None] * 3
@@ -88,14 +95,17 @@ def test_what_changes_the_model_stays_a_constant():
 
 def test_an_elastic_floor_stays_elastic():
     """It bounces for ever and is never rolled on; nor does a program hold the end of bounces that cannot end."""
-    floor = lambda e: {"floor": Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Smooth(e))}
+
+    def room(e):
+        return Scene(Ball(0.025, 0.046), {"floor": Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Smooth(e))})
+
+    def lines(scene):
+        program = jax.jit(lambda x: simulate(scene, x, t1=3.0, throw=False).final).lower(drop)
+        return program.as_text().count("\n")
+
     drop = BallState([0.0, 0.0, 0.1], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
-    text = lambda scene: jax.jit(lambda x: simulate(scene, x, t1=3.0, throw=False).final).lower(drop).as_text()
-    elastic, lossy = (len(text(traced(Scene(Ball(0.025, 0.046), floor(e)))).splitlines()) for e in (1.0, 0.9))
-    assert elastic < 0.7 * lossy
-    scene = traced(Scene(Ball(0.025, 0.046), floor(1.0)))
-    bounced = simulate(scene, drop, t1=3.0)
-    exact = simulate(Scene(Ball(0.025, 0.046), floor(1.0)), drop, t1=3.0)
+    assert lines(traced(room(1.0))) < 0.7 * lines(traced(room(0.9)))
+    bounced, exact = (simulate(scene, drop, t1=3.0) for scene in (traced(room(1.0)), room(1.0)))
     assert int(bounced.n_impacts) == int(exact.n_impacts) > 10
     np.testing.assert_allclose(bounced.final.position, exact.final.position, rtol=1e-12)
 
