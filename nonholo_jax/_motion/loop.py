@@ -306,7 +306,7 @@ def turn(
     cases = [(crossed & full, RESULTS.max_impacts), (crossed & stuck, RESULTS.corner), (crossed & failed, met.fault),
              (settled, RESULTS.at_rest), (broken, RESULTS.invalid_state), (exhausted, RESULTS.step_limit)]  # fmt: skip
     code = functools.reduce(lambda code, case: where(case[0], case[1]._value, code), cases, c.result._value)
-    goes_on = kept & ~ended
+    goes_on = active & kept & ~ended
     return c._replace(
         time=where(struck, until, where(ended, time, c.time)),
         ahead=where(ended, ahead, c.ahead),
@@ -316,11 +316,11 @@ def turn(
         window=where(goes_on, frozen(found.window), jnp.inf),
         touching=where(struck, name, where(through, np.int32(-1), c.touching)),
         jumped=where(ended, struck, c.jumped),
-        control=keep(ended | ~kept, control, c.control),
+        control=keep(active & (ended | ~kept), control, c.control),
         since=where(struck, 0.0, where(ended, since, c.since)),
         n_impacts=c.n_impacts + struck.astype(jnp.int32),
         n_arcs=n_arcs,
-        n_turns=c.n_turns + 1,
+        n_turns=c.n_turns + active.astype(jnp.int32),
         n_at_once=where(struck, n_at_once, c.n_at_once),
         done=c.done | reached | stopped | settled | exhausted | broken,
         result=_result_of(code),

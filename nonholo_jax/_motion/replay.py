@@ -1,7 +1,8 @@
 """The motion of a system, with derivatives in both modes: find, then replay.
 
-The event loop runs without derivatives. Where they are asked for it runs again, in tiles, and records the path (sizes
-of arcs, contacts), a part at a time, and each part is repeated with derivatives in a scan that both modes can handle.
+The event loop runs without derivatives. Where they are asked for it runs again, in tiles, and records the path a part
+at a time: for every arc, what it began with, its size, and the contact that ended it. Each arc is then repeated with
+derivatives on its own, from what it began with: in order for forward mode, from the last to the first in reverse.
 """
 
 from collections.abc import Callable
