@@ -4,8 +4,8 @@
 
 Sizes are lines of StableHLO with an operation, constants included, calls expanded at every call site, without host
 callbacks. Times are those of a fresh process for each row, whose imports are not counted, with JAX's cache on disk off;
-a second call is the median of 50. The exit code is 1 if a size is above its budget. Times are printed beside theirs, and
-do not count: they depend on the machine, and on what else it does.
+a second call is the median of 50. The exit code is 1 if a size is above its budget. Times are printed beside theirs,
+and do not count: they depend on the machine, and on what else it does.
 """
 
 import argparse
@@ -101,7 +101,7 @@ def _pegs() -> tuple:
     for i in range(4):
         for j in range(7):
             place = ((j - 3 + 0.5 * (i % 2)) * 0.1, 0.0, 0.3 + 0.1 * i)
-            surfaces[f"peg_{i}_{j}"] = Cylinder(place, (0.0, 1.0, 0.0), 0.01, law)
+            surfaces[f"peg_{i}_{j}"] = Cylinder(point=place, axis=(0.0, 1.0, 0.0), radius=0.01, law=law)
     x = np.linspace(-0.1, 0.1, 2000)
     position = np.stack([x, 0.0 * x, 0.0 * x + 0.9], axis=1)
     return Scene(Ball(0.008, 0.005), surfaces), BallState(position, 0.0 * position, 0.0 * position)

@@ -21,6 +21,7 @@ from helpers import (
     all_surfaces,
     arrays,
     fast_jit,
+    generator,
     lane,
     named,
     scene_of,
@@ -475,3 +476,22 @@ def test_an_arc_that_nothing_cuts_has_finite_derivatives():
     slopes = jax.jit(jax.grad(end))(state)
     np.testing.assert_allclose(slopes.position, 1.0, rtol=1e-6)  # nothing but a flight
     assert np.isfinite(ravel_pytree(slopes)[0]).all()
+
+
+def test_lanes_that_wait_for_others_keep_their_steps(getkey):
+    """A reverse gradient looks through the path in parts, and a lane that has come to the end of a part waits for the
+    others. It has the same derivatives as alone."""
+    surface = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Rough(0.8, 0.3))
+    scene = Scene(Ball(**BALL), {"floor": surface}, air=Air(**AIR))
+    rng, n = generator(getkey()), 4
+    position = rng.normal(0.0, 1.0, (n, 3)) * [1.0, 1.0, 0.0] + np.linspace([0.0, 0.0, 0.3], [0.0, 0.0, 2.0], n)
+    throw = states(position, rng.normal(0.0, 2.0, (n, 3)), rng.normal(0.0, 10.0, (n, 3)))
+    motion = Integrated(rtol=1e-11, atol=1e-11)
+    run = lambda state: simulate(scene, state, t1=2.0, motion=motion, log_size=0, throw=False)  # noqa: E731
+    gradient = jax.jit(jax.grad(lambda state: run(state).final.position.sum()))
+    arcs = np.asarray(jax.jit(jax.vmap(run))(throw).n_arcs)
+    assert arcs.min() > 32 and len(set(arcs)) > 1  # more than one part, and not the same for all
+    together = jax.jit(jax.vmap(gradient))(throw)
+    for i in range(n):
+        alone = gradient(lane(throw, i))
+        np.testing.assert_allclose(stacked(lane(together, i)), stacked(alone), rtol=1e-9, atol=1e-10)
