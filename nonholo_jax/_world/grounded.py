@@ -170,7 +170,7 @@ class Grounded(AbstractSystem):
     def level(self, contact, time, q, state):
         x = q[:3]
         if isinstance(contact, Member):
-            on = state.support == contact.number
+            on = phase_of(state) == contact.number
             return where(on, 1.0, self.scene.level(contact, time, x, state.flight))
         if contact == self._end_of_slip:
             heading = self._below(time, state).heading
@@ -193,7 +193,7 @@ class Grounded(AbstractSystem):
     def bend(self, contact, time, window, state):
         place = window._replace(coefficients=window.coefficients[:3])
         if isinstance(contact, Member):
-            bend, skip = self.scene.bend(contact, time, place, state.flight), state.support == contact.number
+            bend, skip = self.scene.bend(contact, time, place, state.flight), phase_of(state) == contact.number
         elif contact == self._end_of_slip:
             heading = self._below(time, state).heading
             bend = window._replace(coefficients=window.coefficients[3:]).along(heading, rolling.NONE).bend

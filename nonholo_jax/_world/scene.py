@@ -356,7 +356,7 @@ def _law(surface: AbstractSurface | Stack) -> AbstractContactLaw:
     return surface.surface.law if isinstance(surface, Stack) else surface.law
 
 
-def _rows(law: AbstractContactLaw, hit: Any, normal: Vector3, dtype: Any) -> Any:
+def _rows(law: AbstractContactLaw, hit: Any, normal: Any, dtype: Any) -> Any:
     """`rows_of` one surface, or of all that are in a stack."""
     if jnp.ndim(hit) == 0:
         return rows_of(law, normal, hit, dtype)
