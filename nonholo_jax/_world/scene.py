@@ -353,7 +353,7 @@ class Scene(AbstractSystem):
 
 
 def _law(surface: AbstractSurface | Stack) -> AbstractContactLaw:
-    return surface.surface.law if isinstance(surface, Stack) else surface.law
+    return surface.first.law if isinstance(surface, Stack) else surface.law
 
 
 def _rows(law: AbstractContactLaw, hit: Any, normal: Any, dtype: Any) -> Any:

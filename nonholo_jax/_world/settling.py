@@ -46,7 +46,7 @@ class Floors:
     """The surfaces of `scene` to stay on. Where a choice is none of them, what it gets are harmless numbers."""
 
     def __init__(self, scene: Scene):
-        kinds = [each.surface if isinstance(each, Stack) else each for each in scene.surfaces]
+        kinds = [each.first if isinstance(each, Stack) else each for each in scene.surfaces]
         self.indices = [i for i, surface in enumerate(kinds) if _can_settle(surface)]
         self._ball, floors = scene.ball, [kinds[i] for i in self.indices]
         # Whether a ball may slide against friction, so that its slip is followed.

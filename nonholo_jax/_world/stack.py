@@ -32,6 +32,11 @@ class Stack(eqx.Module):
         index = jnp.clip(index, 0, self.count - 1)
         return jax.tree.map(lambda x: x if is_constant(x) else x[index], self.surface)
 
+    @property
+    def first(self) -> AbstractSurface:
+        """One of them, for what they have in common."""
+        return jax.tree.map(lambda x: x if is_constant(x) else x[0], self.surface)
+
     def each(self, start: int, function: Callable[[Member], Any]) -> Any:
         """A function of every surface, with an axis in front; the first of them is number `start`."""
         arrays, constants = eqx.partition(self.surface, eqx.is_array)
