@@ -26,9 +26,8 @@ scenes = pytest.mark.parametrize("in_air", [False, True], ids=["exact", "integra
 
 
 def throws(dtype, *axes):
-    return states(
-        *[jnp.broadcast_to(jnp.asarray(x), (*axes, 3)) for x in ([0.0, 0, 1], [1.0, 0, 0], [0, 3.0, 0])], dtype
-    )
+    parts = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 3.0, 0.0]
+    return states(*[np.broadcast_to(x, (*axes, 3)) for x in parts], dtype)
 
 
 def alone(scene, state):
