@@ -257,7 +257,7 @@ def _crossing_time_jvp(primals: tuple, tangents: tuple) -> tuple:
     contact = system.choice(index)
 
     def level(system: AbstractSystem, arc: Arc, s: Any) -> Any:
-        q = arc.position(s)
+        q, contact = arc.position(s), system.choice(index)  # its surfaces are those of this system
         levels = [system.level(each, arc.time, q, arc.start) for each in contact.members]
         return contact.of([jnp.asarray(level, s.dtype) for level in levels])
 
