@@ -85,7 +85,7 @@ def _scene(air: bool = False) -> Any:
     from nonholo_jax import Air, Ball, Box, Plane, Rough, Scene
 
     law = Rough(0.9)
-    table = Box((0.6, 0.0, 0.715), (0.6, 0.4, 0.015), law)
+    table = Box(center=(0.6, 0.0, 0.715), half_size=(0.6, 0.4, 0.015), law=law)
     surfaces = {"floor": Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), law), "table": table}
     return Scene(Ball(0.025, 0.046), surfaces, air=Air() if air else None)
 
