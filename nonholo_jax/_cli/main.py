@@ -2,10 +2,13 @@
 
 import argparse
 import contextlib
+import gc
+import importlib
 import json
 import math
 import os
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from importlib import metadata
@@ -62,6 +65,8 @@ def main(argv: list[str] | None = None) -> int:
         options = _parser().parse_args(argv)
         if argv is None:
             _choose_for_xla(options.verb)
+            # Tracing makes many objects that stay: to look for garbage among them again and again takes a tenth of it.
+            gc.set_threshold(100_000, 50, 50)
         return _run(options, from_start=argv is None)
     except _BadInput as error:
         print(f"nonholo: {' '.join(str(error).split())}", file=sys.stderr)
@@ -138,6 +143,8 @@ def _run(options: argparse.Namespace, from_start: bool) -> int:
         # Not where times of compilation are measured, nor by processes that would write side by side.
         alone = options.verb not in _IN_BOTH and getattr(options, "coordinator", None) is None
         stack.enter_context(programs_kept(alone and not options.no_cache))
+        if folder is not None and not options.no_plot:  # what draws comes while XLA compiles
+            threading.Thread(target=importlib.import_module, args=("matplotlib.figure",), daemon=True).start()
         clock = _CompileClock()
         if sys.stderr.isatty():
             print(f"nonholo: compiling the {options.verb}; this takes most of the time", file=sys.stderr, flush=True)

@@ -6,7 +6,6 @@ import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -223,9 +222,10 @@ def _simulate(document: Document, scene: Scene) -> SimulateTask | None:
     if table.motion == "integrated":
         named = {name: getattr(table, name) for name in ("rtol", "atol", "dt0", "max_steps")}
         options = {name: value for name, value in named.items() if value is not None}
-        solver = diffrax.Tsit5() if table.solver is None else _solver(table.solver)
+        if table.solver is not None:
+            options["solver"] = _solver(table.solver)
         try:
-            motion = Integrated(solver=solver, **options)
+            motion = Integrated(**options)
         except ValueError:  # the one thing left that can be wrong
             what = f"`simulate.dt0` must be given for the constant steps of {table.solver!r}, but got nothing"
             raise SceneError(f"{what}; add dt0 = 1e-3 (seconds)") from None
@@ -233,6 +233,8 @@ def _simulate(document: Document, scene: Scene) -> SimulateTask | None:
 
 
 def _solver(name: str) -> Any:
+    import diffrax
+
     known = {}
     for key, value in vars(diffrax).items():
         is_solver = isinstance(value, type) and issubclass(value, diffrax.AbstractSolver)

@@ -25,6 +25,7 @@ from .rotation import matrix as matrix, rolled as rolled, turned as turned
 from .shared import shared as shared
 from .tangents import Iteration as Iteration, tangent_of as tangent_of
 from .tiles import (
+    LEAST_EFFORT as LEAST_EFFORT,
     along as along,
     by_tiles as by_tiles,
     free_devices as free_devices,

@@ -14,6 +14,9 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.sharding import Mesh, PartitionSpec
 
+# For `jit` on a CPU: XLA takes no pains over a program that will not run for long. No inner `jit` may have options.
+LEAST_EFFORT: Any = {"compiler_options": {"xla_backend_optimization_level": 0}}
+
 
 def on_cpu() -> bool:
     """Whether what is traced now is for a CPU: JAX's default backend, unless `jax.default_device` says otherwise."""

@@ -9,7 +9,6 @@ that tolerance.
 
 from typing import Any
 
-import diffrax
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -49,6 +48,8 @@ def motion_for(scene: Any, accuracy: float, state: Any, t0: Any, t1: Any, closed
         tolerance = jnp.minimum(tolerance, (accuracy / (_BETWEEN * growth)) ** (4.0 / 3.0))
     # No relative part: the error is asked for in metres, however fast the ball is. Below rounding no step is accepted.
     tolerance = jnp.maximum(tolerance, 2.0 * float(jnp.finfo(dtype).eps))
+    import diffrax
+
     control = diffrax.PIDController(rtol=0.0, atol=tolerance, norm=rms)
     solver = diffrax.Dopri8() if tight else diffrax.Tsit5()
     return Integrated(solver=solver, stepsize_controller=control, atol=accuracy / _GROWTH)

@@ -262,8 +262,10 @@ def _crossing_time_jvp(primals: tuple, tangents: tuple) -> tuple:
         return contact.of([jnp.asarray(level, s.dtype) for level in levels])
 
     s = crossing_time(*primals)
-    _, rate = jax.jvp(lambda s: level(system, arc, s), (s,), (jnp.ones_like(s),))
     _, change = eqx.filter_jvp(lambda system, arc: level(system, arc, s), (system, arc), tangents[2:])
+    if change is None:  # a spin alone moves no arc before the first impact
+        return s, None
+    _, rate = jax.jvp(lambda s: level(system, arc, s), (s,), (jnp.ones_like(s),))
     # An arc that nothing cuts keeps its s: a division by nothing could overflow, and its derivative with it.
     noise = where(index >= 0, contact.of([_noise(system, each, arc) for each in contact.members]), jnp.inf)
     steep = jnp.abs(rate) > noise * frozen(norm(arc.tangent(s)))

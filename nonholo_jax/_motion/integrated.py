@@ -3,18 +3,23 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+import lazy_loader
 import numpy as np
 
 from .._math import Scalar, frozen, plus, root, shared, times, total
 from .crossing import Arc
 from .motion import AbstractMotion, Piece, check_counts
+
+if TYPE_CHECKING:
+    import diffrax
+else:
+    diffrax = lazy_loader.load("diffrax")  # a third of the seconds that importing takes, and not needed by parabolas
 
 
 def rms(tree: Any) -> Any:
@@ -55,7 +60,7 @@ class Integrated(AbstractMotion):
     ```
     """
 
-    solver: diffrax.AbstractSolver = diffrax.Tsit5()
+    solver: "diffrax.AbstractSolver" = eqx.field(default_factory=lambda: diffrax.Tsit5())
     stepsize_controller: Any = None
     rtol: float = eqx.field(static=True, default=1e-8)
     atol: float = eqx.field(static=True, default=1e-8)
@@ -163,7 +168,7 @@ def _arrays(z: Any, like: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(x, dtype=like.dtype), z)
 
 
-def _term(system: Any, state: Any) -> diffrax.ODETerm:
+def _term(system: Any, state: Any) -> "diffrax.ODETerm":
     def field(t, z, args):
         q, v = z
         return _arrays(system.derivative(t, state, q, v), t)

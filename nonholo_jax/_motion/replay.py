@@ -8,7 +8,6 @@ derivatives on its own, from what it began with: in order for forward mode, from
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
@@ -264,12 +263,22 @@ def run(
 ) -> Outcome:
     """Move a system from t0 to t1 through its impacts, differentiably; see `simulate`."""
     options: dict[str, Any] = {"max_impacts": max_impacts, "log_rows": log_rows}
-    if adjoint is None:
+    kind = _loop_kind(adjoint)
+    if kind is None:
         return _find_or_replay(system, motion, state, t0, t1, **options)
+    return find(system, motion, state, t0, t1, kind=kind, **options)
+
+
+def _loop_kind(adjoint: Any) -> str | None:
+    """How the loop itself is differentiated, as `find` has it, for an `adjoint` or for such a kind."""
+    if adjoint is None or adjoint in ("lax", "checkpointed"):
+        return adjoint
+    import diffrax
+
     if isinstance(adjoint, diffrax.ForwardMode):
-        return find(system, motion, state, t0, t1, kind="lax", **options)
+        return "lax"
     if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint):
-        return find(system, motion, state, t0, t1, kind="checkpointed", **options)
+        return "checkpointed"
     raise ValueError(
         "Argument `adjoint` must be None, diffrax.ForwardMode() or diffrax.RecursiveCheckpointAdjoint(), but got "
         f"{adjoint}; try None, which serves both modes."

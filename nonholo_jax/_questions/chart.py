@@ -38,7 +38,7 @@ class Chart(eqx.Module):
 
 
 def limits_of(scene, state, names, bounds: Mapping[str, Sequence[float | int]], dtype) -> tuple[Array, Array]:
-    low, high = [-jnp.inf] * len(names), [jnp.inf] * len(names)
+    low, high = np.full((2, len(names)), ((-np.inf,), (np.inf,)))
     for name, pair in bounds.items():
         for full in expand(scene, state, [name]):
             if full not in names:
@@ -50,13 +50,16 @@ def limits_of(scene, state, names, bounds: Mapping[str, Sequence[float | int]], 
                     f"Argument `bounds[{name!r}]` must be (lowest, highest), but got {pair}; try exchanging."
                 )
             low[names.index(full)], high[names.index(full)] = pair
-    return jnp.asarray(low, dtype=dtype), jnp.asarray(high, dtype=dtype)
+    return jnp.asarray(low.astype(dtype)), jnp.asarray(high.astype(dtype))
 
 
 def chart_of(scene, state, names, first: Any, limits: tuple) -> Chart:
     """Coordinates in which one is a natural step: a rolling spin for spins, the speed for velocities."""
     speed = float(np.linalg.norm(np.asarray(state.velocity))) or 1.0
     natural = {"throw.velocity": speed, "throw.spin": speed / float(scene.ball.radius), "throw.position": 1.0}
-    sizes = [natural.get(name.rsplit(".", 1)[0], abs(float(x)) or 1.0) for name, x in zip(names, first, strict=True)]
+    sizes = [
+        natural.get(name.rsplit(".", 1)[0], abs(float(x)) or 1.0)
+        for name, x in zip(names, np.asarray(first), strict=True)
+    ]
     low, high = limits
-    return Chart(first, jnp.asarray(sizes, dtype=first.dtype), low, high)
+    return Chart(first, jnp.asarray(np.asarray(sizes, first.dtype)), low, high)

@@ -1,17 +1,17 @@
 """Inverse problems: which throw, or which scene, reaches a goal."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from .._math import RESULTS, is_failure, result_name, surfaces_hit
+from .._math import LEAST_EFFORT, RESULTS, is_failure, on_cpu, result_name, surfaces_hit
 from .._motion import Trajectory, checked, simulate
 from .._world import BallState, Scene
 from .chart import Chart, chart_of, limits_of
@@ -19,6 +19,7 @@ from .goal import AbstractGoal
 from .names import expand, read, write
 
 _CANDIDATES_PER_START = 64
+_FEW_STARTS = 32
 _REFUSED = 1e3  # residual, in m, of a motion that fails or leaves the itinerary: worse than any that does not
 
 
@@ -137,30 +138,28 @@ def design(
     motion, _ = checked(scene, motion, max_impacts, None, slides=sum_trains)
     timed = isinstance(goal, AbstractGoal) and goal.passes_after is not None and not motion.is_closed_form
     how = (max_impacts, motion, sum_trains, timed)
-    times = (jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
-    problem = _Problem(scene, state, goal, *times, names, _wanted(scene, itinerary), *how)
+    t0, t1 = (jnp.asarray(np.asarray(t, dtype)) for t in (t0, t1))
+    problem = _Problem(scene, state, goal, t0, t1, names, _wanted(scene, itinerary), *how)
     first = read(scene, state, names)
     chart = chart_of(scene, state, names, first, limits_of(scene, state, names, bounds or {}, dtype))
-    initial = _starts(problem, chart, first, n_starts, jax.random.key(0) if key is None else key)
-    descent = _descend(problem, chart, initial, _least_squares_solver(solver), max_steps)
-    begun, found, (miss, met, hit, result, time), steps = descent
-    starts = Starts(begun, found, miss, met, steps, hit, result)
+    key = jax.random.key(0) if key is None else key
+    starts, times = _searched(problem, chart, first, n_starts, key, _least_squares_solver(solver), max_steps)
     best = _best(starts, chart, first, tolerance)
-    values = starts.found[best]
+    values = jnp.asarray(starts.found[best])
     scene, state = write(scene, state, names, values)
-    trajectory = _up_to_goal(problem, values, time[best])
+    trajectory = _up_to_goal(problem, values, times[best])
     return Design(
         state=state,
         scene=scene,
         names=names,
         values=values,
-        loss=0.5 * miss[best] ** 2,
-        miss=miss[best],
-        converged=bool(met[best] & (miss[best] <= tolerance)),
+        loss=jnp.asarray(0.5 * starts.miss[best] ** 2),
+        miss=jnp.asarray(starts.miss[best]),
+        converged=bool(starts.met[best] & (starts.miss[best] <= tolerance)),
         itinerary=surfaces_hit(scene.names, trajectory.impacts),
         trajectory=trajectory,
-        starts=starts,
-        evaluations=n_starts * _CANDIDATES_PER_START + int(np.sum(np.asarray(steps))),
+        starts=jax.tree.map(jnp.asarray, starts),
+        evaluations=n_starts * _CANDIDATES_PER_START + int(np.sum(starts.steps)),
         tolerance=float(tolerance),
     )
 
@@ -168,10 +167,11 @@ def design(
 def _up_to_goal(problem: "_Problem", values: Any, time: Any) -> Trajectory:
     """The picture and the report end at the goal. Where that is an impact, rounding must not end them before it."""
     eps = float(jnp.finfo(time.dtype).eps)
-    later = time + 64.0 * eps * (jnp.abs(time) + jnp.abs(problem.t1))
+    t1 = np.asarray(problem.t1)
+    later = time + 64.0 * eps * (abs(time) + abs(t1))
     is_passage = isinstance(problem.goal, AbstractGoal) and problem.goal.passes_after is not None
-    end = time if is_passage else jnp.minimum(later, problem.t1)
-    return problem.trajectory(values, jnp.where(jnp.isfinite(end), end, problem.t1))
+    end = time if is_passage else min(later, t1)
+    return problem.trajectory(values, jnp.asarray(end if np.isfinite(end) else t1, t1.dtype), adjoint=None)
 
 
 class _Problem(eqx.Module):
@@ -189,12 +189,14 @@ class _Problem(eqx.Module):
     sum_trains: bool = eqx.field(static=True)
     timed: bool = eqx.field(static=True)  # the time of passing through the goal is one more coordinate, the last
 
-    def trajectory(self, values: Any, t1: Any = None) -> Trajectory:
+    def trajectory(self, values: Any, t1: Any = None, adjoint: Any = "lax") -> Trajectory:
+        """The motion. In a search the loop itself is differentiated, forward: value and Jacobian are one program then,
+        and not two, one after the other."""
         scene, state = write(self.scene, self.state, self.names, values)
         most = self.max_impacts if self.wanted is None else len(self.wanted)
         t1 = self.t1 if t1 is None else t1
         options = {"max_impacts": most, "motion": self.motion, "sum_trains": self.sum_trains, "throw": False}
-        return simulate(scene, state, t1=t1, t0=self.t0, **options)
+        return simulate(scene, state, t1=t1, t0=self.t0, adjoint=adjoint, **options)
 
     def residual(self, values: Any) -> tuple[Any, tuple]:
         """The goal's residual, refused where the motion is none that was asked for; and what happened."""
@@ -272,8 +274,12 @@ def _wanted(scene: Scene, itinerary: Sequence[str] | None) -> tuple[int, ...] | 
 
 
 def _least_squares_solver(solver: Any) -> Any:
+    import optimistix as optx
+
     if solver is None:
         return optx.LevenbergMarquardt(rtol=1e-12, atol=1e-12)
+    import optax
+
     if isinstance(solver, optax.GradientTransformation):
         return optx.OptaxMinimiser(solver, rtol=1e-10, atol=1e-12)
     if not isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
@@ -284,7 +290,6 @@ def _least_squares_solver(solver: Any) -> Any:
     return solver
 
 
-@eqx.filter_jit
 def _starts(problem: _Problem, chart: Chart, first: Any, n_starts: int, key: Any) -> Any:
     """The first guess and the best of many random candidates, in coordinates."""
     shape = (n_starts * _CANDIDATES_PER_START - 1, first.size)
@@ -309,7 +314,11 @@ def _residual_jvp(primals, tangents, *, problem: _Problem, chart: Chart):
     then compiles this one program, instead of a value, its linearization and what reverse mode would want to keep."""
     (u,), (du,) = primals, tangents
     push = lambda e: jax.jvp(lambda u: problem.at(u, chart), (u,), (e,), has_aux=True)  # noqa: E731
-    value, columns, aside = jax.vmap(push, out_axes=(None, 1, None))(jnp.eye(u.size, dtype=u.dtype))
+    if u.size == 1:  # without an axis of directions, which would take Python a while to add
+        value, column, aside = push(jnp.ones_like(u))
+        columns = column[:, None]
+    else:
+        value, columns, aside = jax.vmap(push, out_axes=(None, 1, None))(jnp.eye(u.size, dtype=u.dtype))
     return (value, aside), (columns @ du, jax.tree.map(lambda _: None, aside))
 
 
@@ -318,8 +327,11 @@ def _loss(u: Any, problem: _Problem, chart: Chart) -> tuple[Any, tuple]:
     return 0.5 * jnp.sum(residual**2), aside
 
 
-@eqx.filter_jit
-def _descend(problem: _Problem, chart: Chart, initial: Any, solver: Any, max_steps: int) -> tuple:
+def _descend(problem: _Problem, chart: Chart, initial: Any, solver: Any, max_steps: int, in_a_row: bool) -> tuple:
+    """Local searches from each start, one after the other or all at once: a few parabolas take less time than Python
+    takes to give each operation an axis more."""
+    import optimistix as optx
+
     def one(u):
         options = {"max_steps": max_steps, "throw": False, "has_aux": True}
         if isinstance(solver, optx.AbstractLeastSquaresSolver):
@@ -330,7 +342,37 @@ def _descend(problem: _Problem, chart: Chart, initial: Any, solver: Any, max_ste
         values = [chart.value(each[:d].astype(problem.t1.dtype)) for each in (u, solution.value)]
         return *values, solution.aux, solution.stats["num_steps"]
 
-    return jax.vmap(one)(initial)
+    return jax.lax.map(one, initial) if in_a_row else jax.vmap(one)(initial)
+
+
+@functools.cache
+def _programs(cpu: bool, closed_form: bool) -> tuple[Callable, Callable]:
+    """`_starts` and `_descend`, compiled. On a CPU XLA takes no pains over what runs for a few milliseconds."""
+    quickly = LEAST_EFFORT if cpu else {}
+    return eqx.filter_jit(_starts, **(quickly if closed_form else {})), eqx.filter_jit(_descend, **quickly)
+
+
+def _searched(problem: _Problem, chart: Chart, first: Any, n_starts: int, key: Any, solver: Any, max_steps: int):
+    """What each start found, and the time at which its goal is reached. XLA compiles one program while Python traces
+    the next; what is compiled here, or was before, is not compiled again when it is called."""
+    closed_form = problem.motion.is_closed_form
+    rank, descend = _programs(on_cpu(), closed_form)
+    asked = (problem, chart, first, n_starts, key)
+    how = (solver, max_steps, closed_form and on_cpu() and n_starts <= _FEW_STARTS)
+    with ThreadPoolExecutor(1) as beside:
+        jobs = [beside.submit(rank.lower(*asked).compile)]
+        like = jnp.asarray(np.zeros((n_starts, first.size + problem.timed), jnp.result_type(float)))
+        jobs.append(beside.submit(descend.lower(problem, chart, like, *how).compile))
+        problem.trajectory(first, adjoint=None)  # the program of the answer
+        for job in jobs:
+            job.result()
+    begun, found, (miss, met, hit, result, times), steps = _arrays(descend(problem, chart, rank(*asked), *how))
+    return Starts(begun, found, miss, met, steps, hit, result), times
+
+
+def _arrays(tree: Any) -> Any:
+    """Arrays of NumPy: outside a compiled function every operation of JAX is a program of its own to compile."""
+    return jax.tree.map(np.asarray, tree)
 
 
 def _best(starts: Starts, chart: Chart, first: Any, tolerance: float) -> int:

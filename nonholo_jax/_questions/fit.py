@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array
 
 from .._motion import AbstractMotion, checked, flat, simulate
@@ -159,6 +158,8 @@ class _Problem(eqx.Module):
 @eqx.filter_jit
 def _search(problem: _Problem, starts: Any, max_steps: int) -> tuple[Any, Any, Any]:
     """The best values, what they miss, and the slopes of what they compute."""
+    import optimistix as optx
+
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
     residual = lambda u, problem: jnp.ravel(problem.misses(problem.chart.value(u)))  # noqa: E731
 

@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._math import is_constant
@@ -98,12 +100,28 @@ def _follow(pair: Any, steps: tuple) -> Any:
 def read(scene: Scene, state: BallState, names: Sequence[str]) -> Float[Array, " n"]:
     """The numbers of those full names, in the dtype of the state."""
     known = places(scene, state)
-    values = []
+    values, dtype = [], state.position.dtype
     for name in names:
         steps, component = known[name]
         value = _follow((scene, state), steps)
+        value = np.asarray(value) if _is_known(value) and eqx.is_array(value) else value
         values.append(value if component is None else value[component])
-    return jnp.stack([jnp.asarray(value, dtype=state.position.dtype) for value in values])
+    if all(map(_is_known, values)):
+        return jnp.asarray(np.asarray(values, dtype))
+    return jnp.stack([jnp.asarray(value, dtype=dtype) for value in values])
+
+
+def _is_known(x: Any) -> bool:
+    """True where NumPy can do what JAX would compile a program for."""
+    return not isinstance(x, jax.core.Tracer)
+
+
+def _replaced(vector: Any, component: int, new: Any) -> Any:
+    if not (_is_known(vector) and _is_known(new)):
+        return vector.at[component].set(new.astype(vector.dtype))
+    changed = np.array(vector)
+    changed[component] = new
+    return jnp.asarray(changed)
 
 
 def write(scene: Scene, state: BallState, names: Sequence[str], values: Any) -> tuple[Scene, BallState]:
@@ -116,7 +134,7 @@ def write(scene: Scene, state: BallState, names: Sequence[str], values: Any) -> 
         if component is not None:
             old = _follow(pair, steps)
             if isinstance(old, jax.Array):
-                new = old.at[component].set(new.astype(old.dtype))
+                new = _replaced(old, component, new)
             else:
                 new = tuple(new if j == component else part for j, part in enumerate(old))
         pair = eqx.tree_at(lambda x, steps=steps: _follow(x, steps), pair, new)

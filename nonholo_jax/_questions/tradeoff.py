@@ -5,9 +5,9 @@ import platform
 import sys
 import time
 from collections.abc import Sequence
+from importlib import metadata
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +18,6 @@ from .._world import BallState, Scene, check_ball_state
 from .fifty_digits import bounced, why_not
 from .ways import Outcome, Program, Setting, Way, ways
 
-SOLVERS = (diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8(), diffrax.Heun())
 _TIGHT, _RIVALS = 1e-14, 1e-13  # tolerances of the reference, whose steps are no longer than this part of the duration,
 _REFERENCE_STEPS = 128  # and of what its gradient is checked against
 _LONGEST = f"1/{_REFERENCE_STEPS} of the duration a step"
@@ -148,7 +147,7 @@ def tradeoff(
     t0: Any = 0.0,
     max_impacts: int = 64,
     sum_trains: bool | None = None,
-    solvers: Sequence[diffrax.AbstractSolver] = SOLVERS,
+    solvers: Sequence[Any] | None = None,
     tolerances: Sequence[float] | None = None,
     steps: Sequence[int] = (16, 32, 64, 128, 256, 512),
     dtypes: Sequence[str] = ("float64", "float32"),
@@ -163,8 +162,8 @@ def tradeoff(
     - `scene`, `t1`, `t0`, `max_impacts`: as in `simulate`; `states`: as in `simulate_batch`, fields of shape (N, 3) in
         float64.
     - `sum_trains`: as in `simulate`; `None` leaves trains out where no throw of the batch has one, as it is faster.
-    - `solvers`: explicit solvers of `diffrax`, each run with adaptive and with fixed steps. `Exact` is run where the
-        scene allows it.
+    - `solvers`: explicit solvers of `diffrax`, each run with adaptive and with fixed steps (default: Tsit5, Dopri5,
+        Dopri8 and Heun). `Exact` is run where the scene allows it.
     - `tolerances`: > 0, of adaptive steps (default: 1e-3 to 1e-13 by powers of ten; in float32 those above 1e-7).
         `steps`: fixed steps are t1 - t0 divided by these numbers, each >= 1.
     - `dtypes`: of `"float64"` and `"float32"`. float32 starts from the rounded throws, which is part of its errors.
@@ -186,6 +185,10 @@ def tradeoff(
     found.cheapest(1e-9).label                               # 'Exact, float64'
     ```
     """
+    import diffrax
+
+    if solvers is None:
+        solvers = (diffrax.Tsit5(), diffrax.Dopri5(), diffrax.Dopri8(), diffrax.Heun())
     _check(scene, states, t0, t1, solvers, tolerances, steps, dtypes, runs)
     motion, _ = checked(scene, None, max_impacts, None, slides=sum_trains is not False)
     study = _Study(Setting(scene, states, t0, t1, max_impacts, sum_trains is True), motion.is_closed_form, progress)
@@ -212,6 +215,8 @@ class _Study:
     """The programs compiled so far, the reference, and what has been run."""
 
     def __init__(self, setting: Setting, exact: bool, progress: bool):
+        import diffrax
+
         self.setting, self.exact = setting, exact
         self.programs: dict[tuple, tuple[Program, float]] = {}
         self.jobs: list[_Job] = []
@@ -371,7 +376,7 @@ def machine(devices: Sequence[Any]) -> str:
     """Kinds of devices, with their numbers where there are several, processor and versions: what times depend on."""
     kinds = [device.device_kind for device in devices]
     names = [f"{kinds.count(kind)} x {kind}" if kinds.count(kind) > 1 else kind for kind in dict.fromkeys(kinds)]
-    versions = f"Python {platform.python_version()}, JAX {jax.__version__}, Diffrax {diffrax.__version__}"
+    versions = f"Python {platform.python_version()}, JAX {jax.__version__}, Diffrax {metadata.version('diffrax')}"
     return f"{', '.join(names)}, {platform.machine()}, {versions}"
 
 
@@ -389,7 +394,7 @@ def _check(scene, states, t0, t1, solvers, tolerances, steps, dtypes, runs) -> N
     names = [type(solver).__name__ for solver in solvers]
     for solver in solvers:
         Integrated(solver, dt0=1.0)  # refuses what is not explicit
-        if isinstance(solver, diffrax.AbstractSolver) and names.count(type(solver).__name__) > 1:
+        if names.count(type(solver).__name__) > 1:
             raise ValueError(f"Argument `solvers` must not repeat a class, but got {names}; try one of each.")
     known = ("float64", "float32")
     if not dtypes or any(dtype not in known for dtype in dtypes) or len(set(dtypes)) < len(dtypes):

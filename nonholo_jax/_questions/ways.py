@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,6 +34,8 @@ class Way(NamedTuple):
         """The motion with a tolerance or a step in s that may be traced, so that one program serves them all."""
         if self.steps == "exact":
             return Exact()
+        import diffrax
+
         if self.steps == "fixed":
             control = diffrax.ConstantStepSize()
             return Integrated(self.solver, stepsize_controller=control, dt0=rung, max_steps=max_steps)

@@ -315,6 +315,21 @@ def test_adjoints_agree(motion, getkey):
     assert relative(found[2], found[0]) < 1e-9
 
 
+def test_a_spin_alone_moves_no_arc_before_the_first_impact():
+    """The derivative of the loop itself: the first arc has none then, and its end none either."""
+    scene = Scene(Ball(0.025, 0.046), {"floor": Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), Rough(0.8))})
+
+    def place(spin, adjoint):
+        state = BallState(jnp.array([0.0, 0.0, 0.5]), jnp.array([1.0, 0.0, 0.0]), spin)
+        return simulate(scene, state, t1=0.9, max_impacts=4, sum_trains=False, adjoint=adjoint).final.position
+
+    spin = jnp.array([0.0, 7.0, 1.0])
+    loop = fast_jit(jax.jacfwd(lambda spin: place(spin, diffrax.ForwardMode())))(spin)
+    arcs = fast_jit(jax.jacfwd(lambda spin: place(spin, None)))(spin)
+    assert np.abs(arcs).max() > 1e-3
+    assert np.abs(loop - arcs).max() < 1e-14
+
+
 # Second derivatives
 
 
