@@ -35,6 +35,7 @@ ROOMS = {
         "names",
         "goal",
         "chart",
+        "jacobian",
         "design",
         "fit",
         "fifty_digits",

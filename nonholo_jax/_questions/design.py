@@ -16,6 +16,7 @@ from .._motion import Trajectory, checked, simulate
 from .._world import BallState, Scene
 from .chart import Chart, chart_of, limits_of
 from .goal import AbstractGoal
+from .jacobian import linearized_whole
 from .names import expand, read, write
 
 _CANDIDATES_PER_START = 64
@@ -303,28 +304,8 @@ def _starts(problem: _Problem, chart: Chart, first: Any, n_starts: int, key: Any
     return jax.vmap(problem.with_time)(u[order], time[order]).astype(jnp.result_type(float))
 
 
-@eqx.filter_custom_jvp
-def _residual(u: Any, *, problem: _Problem, chart: Chart) -> tuple[Any, tuple]:
+def _at(problem: _Problem, chart: Chart, u: Any) -> tuple[Any, tuple]:
     return problem.at(u, chart)
-
-
-@_residual.def_jvp
-def _residual_jvp(primals, tangents, *, problem: _Problem, chart: Chart):
-    """The whole Jacobian in one forward pass, and its product with the tangent. A solver that linearizes the residual
-    then compiles this one program, instead of a value, its linearization and what reverse mode would want to keep."""
-    (u,), (du,) = primals, tangents
-    push = lambda e: jax.jvp(lambda u: problem.at(u, chart), (u,), (e,), has_aux=True)  # noqa: E731
-    if u.size == 1:  # without an axis of directions, which would take Python a while to add
-        value, column, aside = push(jnp.ones_like(u))
-        columns = column[:, None]
-    else:
-        value, columns, aside = jax.vmap(push, out_axes=(None, 1, None))(jnp.eye(u.size, dtype=u.dtype))
-    return (value, aside), (columns @ du, jax.tree.map(lambda _: None, aside))
-
-
-def _loss(u: Any, problem: _Problem, chart: Chart) -> tuple[Any, tuple]:
-    residual, aside = _residual(u, problem=problem, chart=chart)
-    return 0.5 * jnp.sum(residual**2), aside
 
 
 def _descend(problem: _Problem, chart: Chart, initial: Any, solver: Any, max_steps: int, in_a_row: bool) -> tuple:
@@ -332,12 +313,18 @@ def _descend(problem: _Problem, chart: Chart, initial: Any, solver: Any, max_ste
     takes to give each operation an axis more."""
     import optimistix as optx
 
+    residual = functools.partial(linearized_whole, function=eqx.Partial(_at, problem, chart))
+
+    def loss(u):
+        value, aside = residual(u)
+        return 0.5 * jnp.sum(value**2), aside
+
     def one(u):
         options = {"max_steps": max_steps, "throw": False, "has_aux": True}
         if isinstance(solver, optx.AbstractLeastSquaresSolver):
-            solution = optx.least_squares(lambda u, _: _residual(u, problem=problem, chart=chart), solver, u, **options)
+            solution = optx.least_squares(lambda u, _: residual(u), solver, u, **options)
         else:
-            solution = optx.minimise(lambda u, _: _loss(u, problem, chart), solver, u, **options)
+            solution = optx.minimise(lambda u, _: loss(u), solver, u, **options)
         d = len(problem.names)
         values = [chart.value(each[:d].astype(problem.t1.dtype)) for each in (u, solution.value)]
         return *values, solution.aux, solution.stats["num_steps"]

@@ -1,5 +1,6 @@
 """Coefficients from measured bounces, by least squares through the simulator."""
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,15 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._math import LEAST_EFFORT, on_cpu
 from .._motion import AbstractMotion, checked, flat, simulate
 from .._world import BallState, Scene
 from .chart import Chart, chart_of, limits_of
+from .jacobian import linearized_whole, with_jacobian
 from .names import expand, read, write
 
 _ADMISSIBLE = {"restitution": (0.0, 1.0), "tangential": (-1.0, 1.0), "friction": (0.0, math.inf),
                "inertia_ratio": (0.0, math.inf), "radius": (0.0, math.inf), "mass": (0.0, math.inf),
                "drag": (0.0, math.inf), "density": (0.0, math.inf)}  # fmt: skip
 _UNDECIDED = 2.0  # a difference of the criterion below which K. Burnham and D. Anderson call models alike
+_FEW_THROWS = 256
 
 
 class Fit(NamedTuple):
@@ -121,7 +125,8 @@ def fit(
     noise = jax.random.normal(jax.random.key(key) if isinstance(key, int) else key, (n_starts, len(names)), dtype)
     begin = chart.coordinate(first)
     starts = jnp.where(jnp.arange(n_starts)[:, None] == 0, begin[None], begin[None] + noise)
-    values, misses, slopes = (np.asarray(x, dtype=float) for x in _search(problem, starts, max_steps))
+    search = _program(motion.is_closed_form and on_cpu())
+    values, misses, slopes = (np.asarray(x, dtype=float) for x in search(problem, starts, max_steps))
     return _summary(scene, first_throw, names, jnp.asarray(values, dtype=dtype), misses, there, slopes, spread)
 
 
@@ -142,6 +147,8 @@ class _Problem(eqx.Module):
 
     def computed(self, values: Any) -> Any:
         options = {"max_impacts": self.max_impacts, "motion": self.motion, "sum_trains": self.sum_trains}
+        # Of few throws the loop itself is differentiated: one program. The other way goes through many in tiles.
+        options["adjoint"] = "lax" if len(self.wanted) <= _FEW_THROWS else None
 
         def one(throw: BallState) -> Any:
             room, state = write(self.scene, throw, self.names, values)
@@ -155,23 +162,35 @@ class _Problem(eqx.Module):
         return jnp.where(self.weight > 0, (self.wanted - self.computed(values)) * self.weight, 0.0)
 
 
-@eqx.filter_jit
 def _search(problem: _Problem, starts: Any, max_steps: int) -> tuple[Any, Any, Any]:
-    """The best values, what they miss, and the slopes of what they compute."""
+    """The best values, what they miss, and the slopes of that."""
     import optimistix as optx
 
     solver = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
-    residual = lambda u, problem: jnp.ravel(problem.misses(problem.chart.value(u)))  # noqa: E731
+    residual = functools.partial(linearized_whole, function=eqx.Partial(_missed, problem))
+    options = {"max_steps": max_steps, "throw": False, "has_aux": True}
 
     def descended(u: Any) -> tuple[Any, Any]:
-        found = optx.least_squares(residual, solver, u, problem, max_steps=max_steps, throw=False).value
-        cost = jnp.sum(residual(found, problem) ** 2)
-        return found, jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+        solution = optx.least_squares(lambda u, _: residual(u), solver, u, **options)
+        return solution.value, solution.aux
 
     ends, costs = jax.vmap(descended)(starts)
     values = problem.chart.value(ends[jnp.argmin(costs)])
-    slopes = jax.jacfwd(lambda v: jnp.ravel(problem.misses(v)))(values)
-    return values, problem.misses(values), slopes
+    misses, slopes, _ = with_jacobian(lambda values: (jnp.ravel(problem.misses(values)), None), values)
+    return values, misses.reshape(problem.wanted.shape), slopes
+
+
+def _missed(problem: _Problem, u: Any) -> tuple[Any, Any]:
+    """The misses, and the cost, which is infinite where it is no number."""
+    misses = jnp.ravel(problem.misses(problem.chart.value(u)))
+    cost = jax.lax.stop_gradient(jnp.sum(misses**2))
+    return misses, jnp.where(jnp.isfinite(cost), cost, jnp.inf)
+
+
+@functools.cache
+def _program(quickly: bool) -> Callable:
+    """`_search`, compiled; on a CPU without pains where throws are parabolas."""
+    return eqx.filter_jit(_search, **(LEAST_EFFORT if quickly else {}))
 
 
 def _bounds(names: tuple[str, ...], given: Mapping | None) -> dict[str, Any]:
@@ -201,7 +220,7 @@ def _summary(scene, throw, names, values, misses, there, slopes, spread) -> Fit:
         standard_errors=np.sqrt(np.diag(covariance)),
         covariance=covariance,
         scene=write(scene, throw, names, values)[0],
-        residuals=np.where(there, misses / scale, np.nan),
+        residuals=np.where(there, misses / (scale or 1.0), np.nan),
         spread=scale if spread is None else np.asarray(spread, dtype=float),
         n_measured=count,
         criterion=criterion,
