@@ -303,7 +303,7 @@ def interpolation_weights(solver: Any) -> np.ndarray:
     j from 1 to degree - 1; what theta^degree gets follows from the end of the step. Constants, found at trace time by
     evaluating Diffrax's own interpolation class on unit stages and fitting the lowest degree that reproduces it."""
     b_sol = tuple(float(weight) for weight in solver.tableau.b_sol)
-    weights = _weights(solver.interpolation_cls, b_sol, jnp.zeros(()).dtype)
+    weights = _weights(solver.interpolation_cls, b_sol, jnp.result_type(float))
     if weights.ndim == 1:
         raise ValueError(
             f"Argument `solver` must have a polynomial interpolant, but got {solver}; try diffrax.Tsit5()."

@@ -93,7 +93,7 @@ def simulate(
     system = _continued(scene, motion, sum_trains)
     state = scene.received(state, batch=False, t0=t0)
     dtype = jax.tree.leaves(state)[0].dtype
-    t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
+    t0, t1 = (_array(t, dtype) for t in (t0, t1))
     _check_times(t0, t1)
     moving = (system, motion, state, t0, t1)
     few = motion.is_closed_form and max_impacts <= _FEW_IMPACTS and on_cpu()
@@ -145,7 +145,7 @@ def simulate_batch(
     system = _continued(scene, motion, sum_trains)
     states = scene.received(states, batch=True, t0=t0)
     dtype = jax.tree.leaves(states)[0].dtype
-    t0, t1 = (jnp.asarray(t, dtype=dtype) for t in (t0, t1))
+    t0, t1 = (_array(t, dtype) for t in (t0, t1))
     _check_times(t0, t1)
     devices = free_devices((system, motion, states, t0, t1))
     trajectory = _run_batch(system, motion, states, t0, t1, axes, max_impacts, log_rows, adjoint, devices)
@@ -195,7 +195,7 @@ def _ndim(owner: Any, path: tuple) -> int | None:
 
 def _is_traced(arguments: Any) -> bool:
     """True within a transformation."""
-    leaves = [jnp.asarray(np.zeros(())), *jax.tree.leaves(arguments)]
+    leaves = [jax.device_put(np.zeros(())), *jax.tree.leaves(arguments)]
     return any(isinstance(x, jax.core.Tracer) for x in leaves)
 
 
@@ -282,6 +282,13 @@ def checked(
         raise ValueError(f"Argument `motion` must be None, Exact() or Integrated(), but got {motion!r}; try None.")
     motion.check(scene)
     return motion, max_impacts if log_size is None else log_size
+
+
+def _array(time: Any, dtype: Any) -> Any:
+    """An array for a number; for one of Python or NumPy without a program of its own."""
+    if isinstance(time, float | int | np.generic | np.ndarray):
+        return jax.device_put(np.asarray(time, dtype))
+    return jnp.asarray(time, dtype=dtype)
 
 
 def _check_times(t0: Any, t1: Any) -> None:
