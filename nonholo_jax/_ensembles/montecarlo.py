@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from .._math import NAMES_OF_RESULTS, by_tiles, over_devices
+from .._math import NAMES_OF_RESULTS, WIDEST_VECTORS, by_tiles, over_devices, with_options
 from .._motion import AbstractMotion, checked, flat, simulate
 from .._world import BallState, Scene
 from .ensemble import Ensemble
@@ -265,8 +265,7 @@ def _drawn(scene: Scene, sampler: Any, key: Any, u: Any) -> tuple[Any, Scene, Ba
     return jnp.concatenate([state.position, state.velocity, state.spin]), own, state
 
 
-@eqx.filter_jit
-def _run_chunk(plan: _Plan, scene, sampler, key, motion, t0, t1, lanes) -> _Found:
+def _chunk_of(plan: _Plan, scene, sampler, key, motion, t0, t1, lanes) -> _Found:
     options = {"max_impacts": plan.max_impacts, "log_size": plan.log_rows, "sum_trains": plan.sum_trains}
 
     def one(rest, lane):
@@ -294,6 +293,9 @@ def _run_chunk(plan: _Plan, scene, sampler, key, motion, t0, t1, lanes) -> _Foun
         return by_tiles(whole, lanes, count, motion.tile) if plan.log_rows else whole(lanes)
 
     return over_devices(batch, lanes, arrays, plan.devices)
+
+
+_run_chunk = with_options(_chunk_of, WIDEST_VECTORS)
 
 
 class _Runner:

@@ -3,13 +3,12 @@
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
-from .._math import by_tiles, surfaces_hit
+from .._math import LEAST_EFFORT, WIDEST_VECTORS, by_tiles, surfaces_hit, with_options
 from .._motion import AbstractMotion, checked, flat, simulate
 from .._world import Scene
 from .ensemble import Ensemble
@@ -107,7 +106,8 @@ def propagate(
     smooth = {name: m for (name, m), shape in zip(measures.items(), shapes, strict=True) if shape.dtype != bool}
     quantities, _ = quantities_of(smooth, [shape for shape in shapes if shape.dtype != bool])
     mean = np.asarray(flat(smooth.values(), trajectory), dtype=float)
-    jacobian = np.asarray(eqx.filter_jit(jax.jacrev(lambda v: flat(smooth.values(), run(v))))(values), dtype=float)
+    slopes = with_options(jax.jacrev(lambda v: flat(smooth.values(), run(v))), LEAST_EFFORT)
+    jacobian = np.asarray(slopes(values), dtype=float)
     names = tuple(each.name for each in quantities)
     way = surfaces_hit(scene.names, jax.tree.map(np.asarray, trajectory.impacts))
     return Propagation(names, inputs, tuple(way), mean, jacobian, jacobian @ spread @ jacobian.T, spread)
@@ -186,8 +186,9 @@ def expectation(
     return Expectation(float(mean[0]), float(error[0]), gradient, spread)
 
 
-@eqx.filter_jit
-def _slopes(build: Callable, measure: Callable, parameters: Any, key: Any, t0: Any, t1: Any, options: dict, lanes: Any):
+def _slopes_of(
+    build: Callable, measure: Callable, parameters: Any, key: Any, t0: Any, t1: Any, options: dict, lanes: Any
+):
     """The value and its slopes of each of some throws."""
 
     def one(lane: Any) -> Any:
@@ -201,6 +202,9 @@ def _slopes(build: Callable, measure: Callable, parameters: Any, key: Any, t0: A
         return jnp.concatenate([number[None], jax.flatten_util.ravel_pytree(slopes)[0].astype(number.dtype)])
 
     return by_tiles(jax.vmap(one), lanes, lanes[0].shape[0], options["motion"].tile)
+
+
+_slopes = with_options(_slopes_of, WIDEST_VECTORS)
 
 
 class Indices(NamedTuple):

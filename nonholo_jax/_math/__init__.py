@@ -26,6 +26,7 @@ from .shared import shared as shared
 from .tangents import Iteration as Iteration, tangent_of as tangent_of
 from .tiles import (
     LEAST_EFFORT as LEAST_EFFORT,
+    WIDEST_VECTORS as WIDEST_VECTORS,
     along as along,
     by_tiles as by_tiles,
     free_devices as free_devices,
@@ -34,6 +35,7 @@ from .tiles import (
     over_devices as over_devices,
     unless_batched as unless_batched,
     where_needed as where_needed,
+    with_options as with_options,
 )
 from .types import (
     KINDS as KINDS,

@@ -2,6 +2,7 @@
 over a few lanes it stays in the first cache, and each tile ends with its own slowest lane. And over devices, each of
 which takes its share of the lanes and waits for no other."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -14,14 +15,33 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.sharding import Mesh, PartitionSpec
 
-# For `jit` on a CPU: XLA takes no pains over a program that will not run for long. No inner `jit` may have options.
+# Options for `jit` on a CPU. XLA takes no pains over a program that will not run for long, and uses the widest vectors
+# that the processor has, not half of them. An inner `jit` may have none.
 LEAST_EFFORT: Any = {"compiler_options": {"xla_backend_optimization_level": 0}}
+WIDEST_VECTORS: Any = {"compiler_options": {"xla_cpu_prefer_vector_width": 512}}
 
 
 def on_cpu() -> bool:
     """Whether what is traced now is for a CPU: JAX's default backend, unless `jax.default_device` says otherwise."""
     chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     return (getattr(chosen, "platform", chosen) or jax.default_backend()) == "cpu"
+
+
+def is_traced(arguments: Any) -> bool:
+    """Whether what is called now is within a transformation."""
+    leaves = [jax.device_put(np.zeros(())), *jax.tree.leaves(arguments)]
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+
+
+def with_options(function: Callable, options: dict) -> Callable:
+    """`eqx.filter_jit`, with options on a CPU where they may be given."""
+    plain, best = eqx.filter_jit(function), eqx.filter_jit(function, **options)
+
+    @functools.wraps(function)
+    def call(*args):
+        return (best if on_cpu() and not is_traced(args) else plain)(*args)
+
+    return call
 
 
 def in_tiles(function: Callable, size: int, alone: Callable | None = None) -> Callable:

@@ -55,7 +55,7 @@ from .loop import (
 from .motion import AbstractMotion
 
 _ROWS = 32  # arcs of one part of a path
-_HOP_TILE = 512
+_HOP_TILE = 256
 _STRAGGLERS = 64  # lanes that make their turns together
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from .._math import (
     LEAST_EFFORT,
     NO_FAILURES,
+    WIDEST_VECTORS,
     as_number,
     as_pair,
     as_quaternion,
@@ -19,10 +20,10 @@ from .._math import (
     by_tiles,
     free_devices,
     is_failure,
-    on_cpu,
     over_devices,
     result_message,
     result_name,
+    with_options,
 )
 from .._world import AbstractSystem, Scene, grounded, slides_across
 from .accuracy import motion_for
@@ -95,9 +96,8 @@ def simulate(
     dtype = jax.tree.leaves(state)[0].dtype
     t0, t1 = (_array(t, dtype) for t in (t0, t1))
     _check_times(t0, t1)
-    moving = (system, motion, state, t0, t1)
-    few = motion.is_closed_form and max_impacts <= _FEW_IMPACTS and on_cpu()
-    trajectory = (_run_few if few and not _is_traced(moving) else _run)(*moving, max_impacts, log_rows, adjoint)
+    move = _run_few if motion.is_closed_form and max_impacts <= _FEW_IMPACTS else _run
+    trajectory = move(system, motion, state, t0, t1, max_impacts, log_rows, adjoint)
     return _raised(trajectory) if throw else trajectory
 
 
@@ -193,12 +193,6 @@ def _ndim(owner: Any, path: tuple) -> int | None:
     return wanted
 
 
-def _is_traced(arguments: Any) -> bool:
-    """True within a transformation."""
-    leaves = [jax.device_put(np.zeros(())), *jax.tree.leaves(arguments)]
-    return any(isinstance(x, jax.core.Tracer) for x in leaves)
-
-
 def _moved(scene, motion, state, t0, t1, max_impacts: int, log_rows: int, adjoint) -> Trajectory:
     scene = _cast(scene, t1.dtype)
     options = {"max_impacts": max_impacts, "log_rows": log_rows, "adjoint": adjoint}
@@ -208,11 +202,10 @@ def _moved(scene, motion, state, t0, t1, max_impacts: int, log_rows: int, adjoin
 
 
 _run = eqx.filter_jit(_moved)
-_run_few = eqx.filter_jit(_moved, **LEAST_EFFORT)
+_run_few = with_options(_moved, LEAST_EFFORT)
 
 
-@eqx.filter_jit
-def _run_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, log_rows: int, adjoint, devices: int):
+def _moved_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, log_rows: int, adjoint, devices: int):
     scene = _cast(scene, t1.dtype)
     leaves, treedef = jax.tree.flatten(scene)
     options = {"max_impacts": max_impacts, "log_rows": log_rows, "adjoint": adjoint}
@@ -239,6 +232,9 @@ def _run_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, log
     flags = tuple(axis is not None for axis in axes) + (False,) * len(jax.tree.leaves(motion))
     given = {"system": jax.tree.unflatten(treedef, moved), "motion": motion, "initial": states}  # and not copied
     return dataclasses.replace(whole, **given, mapped=flags)
+
+
+_run_batch = with_options(_moved_batch, WIDEST_VECTORS)
 
 
 def _cast(scene: Any, dtype: Any) -> Any:

@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from tqdm import tqdm
 
 from .._impact import Rough
-from .._math import is_success
+from .._math import WIDEST_VECTORS, is_success, on_cpu
 from .._motion import checked, simulate_batch
 from .._world import Air, Ball, BallState, Box, Plane, Scene
 from .rates import LONGEST, Bench, Rate, Rung, climb
@@ -158,7 +158,8 @@ class Program:
         with jax.default_device(self.devices[0]):
             function, self.arguments = _spread({"value": run, "gradient": slope}[job], lanes, alike, self.devices)
             jax.block_until_ready(self.arguments)
-            traced, self.trace_seconds = _timed(lambda: jax.jit(function).trace(*self.arguments))
+            compiled = jax.jit(function, **(WIDEST_VECTORS if on_cpu() else {}))
+            traced, self.trace_seconds = _timed(lambda: compiled.trace(*self.arguments))
             lowered, self.lower_seconds = _timed(traced.lower)
             self.compiled, self.compile_seconds = _timed(lowered.compile)
         before = _peak(self.devices)

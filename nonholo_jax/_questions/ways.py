@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._math import is_success
+from .._math import WIDEST_VECTORS, is_success, on_cpu
 from .._motion import AbstractMotion, Exact, Integrated, rms, simulate_batch
 from .._world import BallState
 
@@ -112,7 +112,8 @@ class Program:
         self.way, self.what, self.longest = way, what, longest
         self.states = setting.states_in(way.dtype)
         self.scales = None if what == "value" else scales_of(setting)
-        self.compiled = jax.jit(make(setting, way, max_steps)).lower(*self._arguments(1.0, longest)).compile()
+        program = jax.jit(make(setting, way, max_steps), **(WIDEST_VECTORS if on_cpu() else {}))
+        self.compiled = program.lower(*self._arguments(1.0, longest)).compile()
 
     def _arguments(self, rung: float | None, longest: float | None) -> tuple:
         number = lambda x: jnp.asarray(1.0 if x is None else x, dtype=self.way.dtype)  # noqa: E731
