@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._math import KINDS, NO_IMPACTS, along, frozen, shared
+from .._math import KINDS, NO_IMPACTS, along, frozen, root, shared
 from .._motion import ImpactLog, Trajectory
 from .._questions import as_point
 
@@ -246,7 +246,7 @@ def _nearest_of(parts: Any) -> Any:
         (s,) = shared([jnp.clip(s - step, low, high)])
     # At the closest point the distance does not depend on s to first order.
     square = sum(_at(part, s) ** 2 for part in parts)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return root(square)
 
 
 def _at(part: tuple, s: Any) -> Any:
