@@ -5,11 +5,10 @@ import jax
 import pytest
 from jaxtyping import install_import_hook
 
-# Hundreds of programs run once each: XLA takes no pains over them. Rounding differs, and with it what a compiler
-# computes twice: to hold under both is more, not less. And its newer code generator for the CPU takes twice as long over
-# these programs, which run no faster for it; versions after 0.10 have no such choice, and stop at a flag that they do not
-# know. What is set already counts: with
-# XLA_FLAGS="--xla_backend_optimization_level=3 --xla_cpu_use_fusion_emitters=true" tests run as users' programs do.
+# Hundreds of programs run once each: XLA takes no pains over them. Rounding differs then, and shows what a compiler
+# computes twice. XLA's newer code generator for the CPU takes twice as long over these programs, which run no faster
+# for it; versions after 0.10 have no such choice, and stop at a flag that they do not know. What is set already counts:
+# with XLA_FLAGS="--xla_backend_optimization_level=3 --xla_cpu_use_fusion_emitters=true" they run as users' programs do.
 _FLAGS = "--xla_backend_optimization_level=0"
 if jax.__version_info__ < (0, 11):
     _FLAGS += " --xla_cpu_use_fusion_emitters=false"

@@ -151,9 +151,10 @@ def root(x: Number) -> Number:
     """Square root, zero for x <= 0, with a zero (not infinite) derivative there."""
     if is_constant(x):
         return math.sqrt(max(x, 0.0))
-    # The maximum keeps 1/(2 sqrt(0)) = inf out of the derivative, where inf * 0 would be NaN. It is tiny: a compiler may
-    # compute x twice, with other roundings, so that once it is zero and once above. That must make no great difference.
-    return where(x > 0, jnp.sqrt(jnp.maximum(x, float(jnp.finfo(x.dtype).tiny))), 0.0)
+    # The maximum keeps 1/(2 sqrt(0)) = inf out of the derivative, where inf * 0 would be NaN. What it takes is tiny: a
+    # compiler may compute x twice, rounded in two ways, so that it is zero once and once above. Both must be small.
+    tiny = float(jnp.finfo(jnp.result_type(x)).tiny)
+    return where(x > 0, jnp.sqrt(jnp.maximum(x, tiny)), 0.0)
 
 
 def ratio(a: Number, b: Number, otherwise: Number = 0.0) -> Number:
