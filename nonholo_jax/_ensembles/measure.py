@@ -246,7 +246,7 @@ def _nearest_of(parts: Any) -> Any:
         (s,) = shared([jnp.clip(s - step, low, high)])
     # At the closest point the distance does not depend on s to first order.
     square = sum(_at(part, s) ** 2 for part in parts)
-    return root(square)
+    return jax.vmap(root)(square)
 
 
 def _at(part: tuple, s: Any) -> Any:
