@@ -151,10 +151,11 @@ def root(x: Number) -> Number:
     """Square root, zero for x <= 0, with a zero (not infinite) derivative there."""
     if is_constant(x):
         return math.sqrt(max(x, 0.0))
-    # The maximum keeps 1/(2 sqrt(0)) = inf out of the derivative, where inf * 0 would be NaN. What it takes is tiny: a
-    # compiler may compute x twice, rounded in two ways, so that it is zero once and once above. Both must be small.
+    positive = x > 0
+    # The double where: the inner one keeps 1/(2 sqrt(0)) = inf out of the derivative, where inf * 0 would be NaN. What
+    # it puts in is tiny: a compiler may compute x twice, rounded in two ways, so that it is zero once and once above.
     tiny = float(jnp.finfo(jnp.result_type(x)).tiny)
-    return where(x > 0, jnp.sqrt(jnp.maximum(x, tiny)), 0.0)
+    return where(positive, jnp.sqrt(where(positive, x, tiny)), 0.0)
 
 
 def ratio(a: Number, b: Number, otherwise: Number = 0.0) -> Number:

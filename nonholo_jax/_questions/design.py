@@ -20,7 +20,7 @@ from .jacobian import linearized_whole
 from .names import expand, read, write
 
 _CANDIDATES_PER_START = 64
-_FEW_STARTS = 32
+_FEW_STARTS, _FEW_IMPACTS = 32, 16
 _REFUSED = 1e3  # residual, in m, of a motion that fails or leaves the itinerary: worse than any that does not
 
 
@@ -291,7 +291,13 @@ def _least_squares_solver(solver: Any) -> Any:
     return solver
 
 
-def _starts(problem: _Problem, chart: Chart, first: Any, n_starts: int, key: Any) -> Any:
+def _each(function: Callable, lanes: Any, in_a_row: bool) -> Any:
+    """The function of lanes, one after the other or all at once: a few parabolas take less time than Python takes to
+    give each operation an axis more."""
+    return jax.lax.map(function, lanes) if in_a_row else jax.vmap(function)(lanes)
+
+
+def _starts(problem: _Problem, chart: Chart, first: Any, n_starts: int, key: Any, in_a_row: bool) -> Any:
     """The first guess and the best of many random candidates, in coordinates."""
     shape = (n_starts * _CANDIDATES_PER_START - 1, first.size)
     bounded = jnp.isfinite(chart.low) & jnp.isfinite(chart.high)
@@ -299,7 +305,7 @@ def _starts(problem: _Problem, chart: Chart, first: Any, n_starts: int, key: Any
     normal = jax.random.normal(spread, shape, first.dtype)
     uniform = jax.random.uniform(flat, shape, first.dtype, minval=-1.0, maxval=1.0)
     u = jnp.concatenate([chart.coordinate(first)[None], jnp.where(bounded[None], jnp.arcsin(uniform), normal)])
-    miss, _, _, _, time = jax.vmap(lambda each: problem.residual(chart.value(each))[1])(u)
+    miss, _, _, _, time = _each(lambda each: problem.residual(chart.value(each))[1], u, in_a_row)
     order = jnp.argsort(miss.at[0].set(-1.0))[:n_starts]  # the first guess always takes part
     return jax.vmap(problem.with_time)(u[order], time[order]).astype(jnp.result_type(float))
 
@@ -309,8 +315,7 @@ def _at(problem: _Problem, chart: Chart, u: Any) -> tuple[Any, tuple]:
 
 
 def _descend(problem: _Problem, chart: Chart, initial: Any, solver: Any, max_steps: int, in_a_row: bool) -> tuple:
-    """Local searches from each start, one after the other or all at once: a few parabolas take less time than Python
-    takes to give each operation an axis more."""
+    """Local searches from each start."""
     import optimistix as optx
 
     residual = functools.partial(linearized_whole, function=eqx.Partial(_at, problem, chart))
@@ -329,7 +334,7 @@ def _descend(problem: _Problem, chart: Chart, initial: Any, solver: Any, max_ste
         values = [chart.value(each[:d].astype(problem.t1.dtype)) for each in (u, solution.value)]
         return *values, solution.aux, solution.stats["num_steps"]
 
-    return jax.lax.map(one, initial) if in_a_row else jax.vmap(one)(initial)
+    return _each(one, initial, in_a_row)
 
 
 @functools.cache
@@ -344,8 +349,9 @@ def _searched(problem: _Problem, chart: Chart, first: Any, n_starts: int, key: A
     the next; what is compiled here, or was before, is not compiled again when it is called."""
     closed_form = problem.motion.is_closed_form
     rank, descend = _programs(on_cpu(), closed_form)
-    asked = (problem, chart, first, n_starts, key)
-    how = (solver, max_steps, closed_form and on_cpu() and n_starts <= _FEW_STARTS)
+    few = n_starts <= _FEW_STARTS and problem.wanted is not None and len(problem.wanted) <= _FEW_IMPACTS
+    in_a_row = closed_form and on_cpu() and few
+    asked, how = (problem, chart, first, n_starts, key, in_a_row), (solver, max_steps, in_a_row)
     with ThreadPoolExecutor(1) as beside:
         jobs = [beside.submit(rank.lower(*asked).compile)]
         like = jnp.asarray(np.zeros((n_starts, first.size + problem.timed), jnp.result_type(float)))
