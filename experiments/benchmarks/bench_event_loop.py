@@ -23,7 +23,6 @@ import numpy as np
 import optimistix as optx
 
 from nonholo_jax import Air, Ball, BallState, Integrated, Plane, Rough, Scene, simulate
-from nonholo_jax._math.vector import Choice
 
 jax.config.update("jax_enable_x64", True)
 
@@ -79,7 +78,7 @@ def restarted(tolerance: float):
         end, y = solution.ts[0], solution.ys[0]
         state = SCENE.unpacked(BallState(y[:3], y[3:], spin))
         hit = jnp.where(y[2] < 0.5 * CEILING, 0, 1)
-        after = SCENE.packed(SCENE.bounced(Choice(hit, 2), end, state))
+        after = SCENE.packed(SCENE.bounced(SCENE.choice(hit), end, state))
         going = end < T1
         velocity = jnp.where(going, after.velocity, y[3:])
         spin = jnp.where(going, after.spin, spin)
