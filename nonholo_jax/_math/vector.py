@@ -154,7 +154,7 @@ def root(x: Number) -> Number:
     positive = x > 0
     # The double where: the inner one keeps 1/(2 sqrt(0)) = inf out of the derivative, where inf * 0 would be NaN. What
     # it puts in is small: a compiler may compute x twice, rounded in two ways, so that it is zero once and once above.
-    # But not so small that its second derivative is infinite.
+    # But not so small that third derivatives are infinite.
     small = math.sqrt(jnp.finfo(jnp.result_type(x)).tiny)
     return where(positive, jnp.sqrt(where(positive, x, small)), 0.0)
 
