@@ -120,18 +120,17 @@ class Block(NamedTuple):
     def _to_edge(self, begun: Any, needed: Any) -> tuple[Any, Any]:
         """From the greater box to the rounded one, by Newton's method from one side, for the level is convex where the
         ball is fast enough; and whether that is so and it got there."""
-        going = lambda c: eqxi.unvmap_any(c[3]) & (c[0] < _NEWTON_STEPS)  # noqa: E731
 
-        def step(carry: tuple) -> tuple:
-            count, h, fits, far = carry
-            value, slope = shared(self.level(h)[:2])
-            fits, far = fits & (value >= -self.noise), far & (value > 0.125 * self.noise) & (slope < 0)
-            return count + 1, h + where(far, value / where(slope < 0, -slope, 1.0), 0.0), fits, far
+        def step(_: Any, h: Any) -> Any:
+            value, slope, _ = self.level(h)
+            far = needed & (value > 0.125 * self.noise) & (slope < 0)
+            return h + where(far, value / where(slope < 0, -slope, 1.0), 0.0)
 
-        begin = (jnp.asarray(0, dtype=jnp.int32), begun, jnp.ones_like(needed), needed)
-        _, h, fits, _ = lax.while_loop(going, step, begin)
+        # Which lanes are still far is not asked after every step: that would be more passes over the batch than steps.
+        steps = jnp.where(eqxi.unvmap_any(needed), _NEWTON_STEPS[begun.dtype.itemsize], 0)
+        h = lax.fori_loop(0, steps, step, begun)
         square, (value, _, square_there) = self.level(begun)[2], self.level(h)
-        return h, ~needed | (fits & (abs(value) <= self.noise) & self.is_convex(jnp.minimum(square, square_there)))
+        return h, ~needed | ((abs(value) <= self.noise) & self.is_convex(jnp.minimum(square, square_there)))
 
     def pulled(self) -> Any:
         """A bound of half the acceleration."""
@@ -171,7 +170,7 @@ class Block(NamedTuple):
         return -self.level(h)[1]
 
 
-_NEWTON_STEPS = 8
+_NEWTON_STEPS = {4: 4, 8: 6}  # by the bytes of a number: what takes more is left to the event loop
 _CONVEX = 32.0  # v^2 over r g / 2 of a ball near an edge, from which on the level is convex with room to spare
 
 

@@ -94,18 +94,22 @@ class Exact(AbstractMotion):
     def __check_init__(self):
         check_counts(safe_steps=self.safe_steps, tile=self.tile)
 
+    @staticmethod
+    def serves(system: AbstractSystem) -> bool:
+        """Whether it can move this system."""
+        return system.is_uniform() and all(system.is_bounded(i) for i in range(system.n_contacts))
+
     def check(self, system):
         if not system.is_uniform():
             raise ValueError(
                 "Argument `motion` must be Integrated() where the acceleration is not uniform (air, or a system other "
                 "than a ball), but got Exact(); try motion=None."
             )
-        for i in range(system.n_contacts):
-            if not system.is_bounded(i):
-                raise ValueError(
-                    "Argument `motion` must be Integrated() for a surface whose curvature is not bounded, but got "
-                    "Exact(); try Implicit(gap, law, curvature=...)."
-                )
+        if not self.serves(system):
+            raise ValueError(
+                "Argument `motion` must be Integrated() for a surface whose curvature is not bounded, but got "
+                "Exact(); try Implicit(gap, law, curvature=...)."
+            )
 
     def max_pieces(self, max_impacts):
         return max_impacts + 1

@@ -268,15 +268,15 @@ def checked(
             raise ValueError(f"Argument `{name}` must be a whole number of at least 0, but got {value!r}; try 64.")
     if wanted is not None and motion is not None:
         raise ValueError(f"Argument `accuracy` must come without `motion`, but got {motion!r}; try motion=None.")
-    if motion is None:
-        bounded = all(scene.is_bounded(i) for i in range(scene.n_contacts))
-        curved = slides and isinstance(scene, Scene) and slides_across(scene)
-        closed = scene.is_uniform() and bounded and not curved
+    chosen = motion is None
+    if chosen:
+        closed = Exact.serves(scene) and not (slides and isinstance(scene, Scene) and slides_across(scene))
         motion = Exact() if closed else Integrated()
         motion = motion if wanted is None else motion_for(scene, *wanted, closed_form=closed)
     if not isinstance(motion, AbstractMotion):
         raise ValueError(f"Argument `motion` must be None, Exact() or Integrated(), but got {motion!r}; try None.")
-    motion.check(scene)
+    if not (chosen and motion.is_closed_form):  # which serves, as was asked above
+        motion.check(scene)
     return motion, max_impacts if log_size is None else log_size
 
 

@@ -1,5 +1,6 @@
 """Where a ball may stay after its last bounce, and what happens when it crosses a contact there or comes to rest."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -402,9 +403,10 @@ def slides_across(scene: Scene) -> bool:
     if any(isinstance(leaf, jax.core.Tracer) or jnp.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
         return False
     # As numbers of Python, on which every operation of JAX would be a program of its own to compile.
-    scene = jax.tree.map(lambda x: float(x) if eqx.is_inexact_array(x) and x.ndim == 0 else x, scene)
-    if all(surface.law.sliding_friction() is None for surface in scene.surfaces):
+    known = functools.partial(jax.tree.map, lambda x: float(x) if eqx.is_inexact_array(x) and x.ndim == 0 else x)
+    if all(known(surface.law).sliding_friction() is None for surface in scene.surfaces):
         return False
+    scene = known(scene)
     with jax.ensure_compile_time_eval():  # known numbers, also within a transformation
         return _meets_slope(scene)
 
