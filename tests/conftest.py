@@ -8,8 +8,11 @@ from jaxtyping import install_import_hook
 # XLA's newer code generator for the CPU takes twice as long over these programs, which run no faster for it. Versions
 # after 0.10 have no such choice, and stop at a flag that they do not know. What is set already counts: with
 # XLA_FLAGS=--xla_cpu_use_fusion_emitters=true the tests run as users' programs do by default.
-if jax.__version_info__ < (0, 11):
-    os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}"
+flags = ["--xla_cpu_use_fusion_emitters=false"] if jax.__version_info__ < (0, 11) else []
+# The least effort of XLA: nearly every program here runs once, for milliseconds, and the library chooses it for single
+# throws itself. To compile as batches do by default: XLA_FLAGS=--xla_backend_optimization_level=3
+flags.append("--xla_backend_optimization_level=0")
+os.environ["XLA_FLAGS"] = " ".join([*flags, os.environ.get("XLA_FLAGS", "")])
 gc.set_threshold(100_000, 50, 50)  # programs are made of many objects that stay
 
 os.environ["NONHOLO_CACHE"] = "off"  # no test writes to the cache of whoever runs it
@@ -18,8 +21,10 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Shapes and dtypes in annotations are checked at run time. This must be the package's first import.
-with install_import_hook("nonholo_jax", "beartype.beartype"):
+# Shapes and dtypes in annotations are checked at run time, in every room but that of arithmetic, whose functions are
+# called by the hundred thousand from checked ones. This must be the package's first import.
+rooms = ("_impact", "_world", "_motion", "_questions", "_ensembles", "_files", "_pictures", "_cli")
+with install_import_hook([f"nonholo_jax.{room}" for room in rooms], "beartype.beartype"):
     import nonholo_jax  # noqa: F401
 
 

@@ -31,8 +31,8 @@ from nonholo_jax import (
 from nonholo_jax._math import Choice
 from nonholo_jax._math.types import result_name
 
-# Compiled for derivatives by the dozen, each run once: without the slow passes of the compiler.
-fast_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+# With the effort that XLA takes by default, which conftest.py turns down: for bounds that are near to rounding.
+full_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 BALL = {"radius": 0.1, "mass": 0.7, "inertia_ratio": 0.4}

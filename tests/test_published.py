@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import lane, stacked, states
+from helpers import full_jit, lane, stacked, states
 
 from nonholo_jax import (
     Ball,
@@ -103,7 +103,7 @@ def test_throw_that_retraces_itself_off_an_underside(motion, getkey):
         there = simulate(scene, state, t1=2 * first.impacts.time[1], max_impacts=8, motion=motion)
         return first.impacts.surface, there
 
-    surface, there = jax.jit(jax.vmap(go))(states(hand, velocity, spin), heights)
+    surface, there = full_jit(jax.vmap(go))(states(hand, velocity, spin), heights)
     assert np.array_equal(surface, np.tile([0, 1], (n, 1)))
     assert np.array_equal(there.n_impacts, np.full(n, 3))
     np.testing.assert_allclose(there.final.position, hand, rtol=0, atol=1e-12)
@@ -228,7 +228,7 @@ def test_final_height_after_a_bounce(motion, mode):
         return simulate(scene, throw, t1=1.0, max_impacts=2, motion=motion, throw=False).final.position[2]
 
     twice = lambda y, v: (height(y, v),) * 2  # noqa: E731
-    slopes, end = jax.jit(mode(twice, argnums=(0, 1), has_aux=True))(jnp.asarray(1.0), jnp.asarray(-2.0))
+    slopes, end = full_jit(mode(twice, argnums=(0, 1), has_aux=True))(jnp.asarray(1.0), jnp.asarray(-2.0))
     assert abs(end - 1.2) < 16 * EPS
     np.testing.assert_allclose(slopes, (-1.0, -1.0), rtol=0, atol=64 * EPS)
 

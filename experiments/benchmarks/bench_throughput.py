@@ -42,7 +42,7 @@ class Section(NamedTuple):
 
 SECTIONS = {
     "limit": Section(limit),
-    "table": Section(table, 16),
+    "table": Section(table),
     "integrated": Section(integrated, 64),
     "gradient": Section(gradient, 64),
     "scaling": Section(scaling),

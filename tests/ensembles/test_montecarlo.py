@@ -382,6 +382,8 @@ if coordinator:
 import test_montecarlo as t
 found = t.study(out=sys.argv[1], records="all", resume=True, chunk=256)
 print("done", found.n, len(jax.local_devices()))
+if coordinator:
+    sys.stdin.read()  # the others cannot come back when the process that brings them together has left
 """
 
 
@@ -390,7 +392,8 @@ def run(folder, *more, devices=1, wait=True):
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", SCRIPT.format(here=here), str(folder), *map(str, more)]
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    process = subprocess.Popen(command, env=environment, text=True, **pipes)
     if not wait:
         return process
     out, error = process.communicate()

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import fast_jit, result_of, results_of, stacked
+from helpers import result_of, results_of, stacked
 
 from nonholo_jax import (
     KINDS,
@@ -408,8 +408,8 @@ def after_all(p, t1):
 
 def test_gradients_through_train_rolling_wall_and_edge():
     """Both modes, and central differences of fourth order: while it rolls, after the wall, and after the edge."""
-    value = fast_jit(jax.vmap(after_all, in_axes=(0, None)))
-    modes = [fast_jit(mode(after_all)) for mode in (jax.jacfwd, jax.jacrev)]
+    value = jax.jit(jax.vmap(after_all, in_axes=(0, None)))
+    modes = [jax.jit(mode(after_all)) for mode in (jax.jacfwd, jax.jacrev)]
     h = 2e-5
     points = [PARAMETERS + k * h * step for k in (1, -1, 2, -2) for step in jnp.eye(PARAMETERS.size)]
     for t1 in (1.05, 3.0, 4.6):
@@ -455,7 +455,7 @@ def test_floor_and_wall_hit_at_one_instant(wall):
         want = collide(before, metric, jnp.asarray(np.vstack(blocks)), mu)
         np.testing.assert_allclose(after, want, rtol=0, atol=1e-13)
     end = lambda v: simulate(corner(1.0), BallState(state.position, v, state.spin), t1=0.9, throw=False)  # noqa: E731
-    slow = fast_jit(jax.jacrev(lambda v: end(v).final.velocity))
+    slow = jax.jit(jax.jacrev(lambda v: end(v).final.velocity))
     assert bool(jnp.isfinite(slow(state.velocity)).all())
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import fast_jit, lane, named, result_of, results_of
+from helpers import lane, named, result_of, results_of
 from systems import (
     MEETING,
     G,
@@ -160,9 +160,9 @@ def test_gradients_through_impacts(name):
         return jnp.sum(weights * jnp.append(*trajectory.final)), trajectory.n_impacts
 
     h = 1e-5
-    (_, n), reverse = fast_jit(jax.value_and_grad(end, has_aux=True))(jnp.zeros(()))
+    (_, n), reverse = jax.jit(jax.value_and_grad(end, has_aux=True))(jnp.zeros(()))
     sides = jnp.asarray([h, -h, 0.0])
-    values, slopes, _ = fast_jit(jax.vmap(lambda x: jax.jvp(end, (x,), (jnp.ones(()),), has_aux=True)))(sides)
+    values, slopes, _ = jax.jit(jax.vmap(lambda x: jax.jvp(end, (x,), (jnp.ones(()),), has_aux=True)))(sides)
     assert int(n) >= 2
     forward, central = slopes[2], (values[0] - values[1]) / (2 * h)
     np.testing.assert_allclose(forward, reverse, rtol=1e-9)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import fast_jit, result_of, results_of, stacked
+from helpers import result_of, results_of, stacked
 
 from nonholo_jax import (
     Air,
@@ -79,7 +79,7 @@ STRAIGHT = {
 def straight():
     """All cases by one program: trains summed and then on to t1, and every bounce computed."""
 
-    @fast_jit  # which shows where two copies of one number, rounded in two ways, would lead into two branches
+    @jax.jit  # which shows where two copies of one number, rounded in two ways, would lead into two branches
     @jax.vmap
     def run(e_n, e_t, f, normal, velocity, spin):
         scene, state = plane_scene(Frictional(e_n, e_t, f), normal), throw(velocity, spin)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import AIR, fast_jit, lane, result_of, states
+from helpers import AIR, lane, result_of, states
 
 from nonholo_jax import (
     Air,
@@ -156,7 +156,7 @@ def test_traced_numbers_and_derivatives_are_those_of_the_members_alone_that_are_
             return jnp.sum(trajectory.final.position), impacts(trajectory)
 
         traced = jax.tree.map(jnp.asarray, scene)
-        return fast_jit(jax.value_and_grad(end, argnums=(0, 1), has_aux=True))(traced, state)
+        return jax.jit(jax.value_and_grad(end, argnums=(0, 1), has_aux=True))(traced, state)
 
     (_, log), (of_scene, of_state) = run(scene)
     assert_same(log, impacts(simulate(scene, state, t1=0.35, max_impacts=N_ROWS, throw=False)))  # of constants
