@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 
 from .._impact import AbstractContactLaw, Contact, along_surface, rolling, train
 from .._math import (
@@ -400,7 +401,7 @@ class Settling(NamedTuple):
 
 def slides_across(scene: Scene) -> bool:
     """Whether a ball is known now, not only when the program runs, to meet a slope that it may slide across."""
-    if any(isinstance(leaf, jax.core.Tracer) or jnp.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
+    if any(isinstance(leaf, jax.core.Tracer) or np.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
         return False
     # As numbers of Python, on which every operation of JAX would be a program of its own to compile.
     known = functools.partial(jax.tree.map, lambda x: float(x) if eqx.is_inexact_array(x) and x.ndim == 0 else x)
