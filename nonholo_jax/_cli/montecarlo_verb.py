@@ -2,10 +2,11 @@
 
 import argparse
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
-from .._ensembles import Ensemble, ImpactCount, Propagation, monte_carlo, propagate
+from .._ensembles import Ensemble, ImpactCount, Propagation, monte_carlo, named_failures, propagate
 
 _ITINERARIES, _PARTS = 8, 3
 
@@ -65,18 +66,11 @@ def run(file: Any, options: argparse.Namespace, folder: Path, progress: bool) ->
     records = options.records
     if records is not None and records != "all":
         records = [name.strip() for name in records.split(",")]
-    return monte_carlo(
-        file.scene,
-        **arguments,
-        chunk=options.chunk,
-        seconds=options.seconds,
-        standard_error=_wanted(options.standard_error),
-        out=folder,
-        resume=options.resume,
-        records=records,
-        record_where=options.where,
-        progress=progress,
-    )
+    how = {"chunk": options.chunk, "seconds": options.seconds, "standard_error": _wanted(options.standard_error)}
+    kept = {"out": folder, "resume": options.resume, "records": records, "record_where": options.where}
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*throws failed")  # the table says it
+        return monte_carlo(file.scene, **arguments, **how, **kept, progress=progress)
 
 
 def first_order(file: Any) -> Propagation:
@@ -104,8 +98,8 @@ def table_of_first_order(linear: Propagation, found: Ensemble) -> list[str]:
         parts = sorted(linear.parts(name).items(), key=lambda item: -item[1])[:_PARTS]
         most = ", ".join(f"{each.removeprefix('throw.')} {size:.2g}" for each, size in parts if size > rounding)
         lines.append(f"  {name:{width}}  {mean:12.6g}  {linear.standard_deviation(name):10.3g}  {most}".rstrip())
-    warnings = linear.against(found)
-    return lines + ["", *(f"  warning: {line}" for line in warnings)] if warnings else lines
+    notes = linear.against(found)
+    return lines + ["", *(f"  warning: {line}" for line in notes)] if notes else lines
 
 
 def report(found: Ensemble) -> dict[str, Any]:
@@ -128,6 +122,7 @@ def report(found: Ensemble) -> dict[str, Any]:
         "quantities": quantities,
         "itineraries": [[list(each.what), *each[1:]] for each in found.itineraries[:100]],
         "results": {each.what: each.count for each in found.results},
+        "failures": {each.what: each.count for each in found.failures},
         "folder": None if found.folder is None else str(found.folder),
     }
 
@@ -155,9 +150,12 @@ def table(found: Ensemble) -> list[str]:
                   for each in rows[:_ITINERARIES]]  # fmt: skip
         rest = sum(each.count for each in rows[_ITINERARIES:])
         if rest:
-            lines.append(f"  {rest / found.n:9.3%}            {len(rows) - _ITINERARIES} others")
+            part = rest / sum(each.count for each in rows)
+            lines.append(f"  {part:9.3%}            {len(rows) - _ITINERARIES} others")
     results = ", ".join(f"{each.what} {each.count}" for each in found.results)
     lines += ["", f"  results: {results}"]
+    failures = named_failures({each.what: each.count for each in found.failures}, found.n)
+    lines += [f"  warning: {failures}"] if failures else []
     if found.folder is not None:
         lines.append(f"  study: {found.folder}")
     return lines

@@ -9,7 +9,7 @@ from .distribution import (
     TruncatedNormal as TruncatedNormal,
     Uniform as Uniform,
 )
-from .ensemble import Ensemble as Ensemble
+from .ensemble import Ensemble as Ensemble, named_failures as named_failures
 from .measure import (
     AbstractMeasure as AbstractMeasure,
     Distance as Distance,

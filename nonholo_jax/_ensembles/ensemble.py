@@ -1,13 +1,14 @@
 """What a Monte Carlo study found."""
 
 import dataclasses
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._math import NAMES_OF_RESULTS
+from .._math import NAMES_OF_RESULTS, NO_FAILURES
 from .._world import Scene
 from .measure import Quantity
 from .statistics import N_BINS, Estimate, Frame, Sums, means, probability, quantiles
@@ -24,10 +25,25 @@ class Frequency(NamedTuple):
     standard_error: float
 
 
+def named_failures(counts: Mapping[str, int], n: int) -> str:
+    """One line on the failures among `n` throws, by name of `RESULTS`, or nothing."""
+    if not counts:
+        return ""
+    each = ", ".join(f"{name} {count}" for name, count in counts.items())
+    return f"{sum(counts.values())} of {n} throws failed ({each}) and are left out of every number"
+
+
+def warn_of_failures(counts: Mapping[str, int], n: int) -> None:
+    line = named_failures(counts, n)
+    if line:
+        warnings.warn(f"{line}; try narrower distributions, or see RESULTS for what each name means.", stacklevel=3)
+
+
 @dataclasses.dataclass(frozen=True)
 class Ensemble:
     """Means, covariances, quantiles, histograms, itineraries and results of a batch of throws. Values that were not
-    there (NaN) are left out of means and counted by `present`; all errors are standard errors.
+    there (NaN), and all values of throws that failed, are left out of every number and counted by `present`; all errors
+    are standard errors.
 
     - `history`: an `Estimate` after so many throws, at most 256 of them.
     - `n`: throws that were run. `quantities`: what was measured. `about`: what determines the numbers.
@@ -105,11 +121,12 @@ class Ensemble:
 
     @property
     def itineraries(self) -> list[Frequency]:
-        """The sequences of surfaces hit, names in a tuple, the most frequent first."""
-        surfaces = self.about["surfaces"]
+        """The sequences of surfaces hit, names in a tuple, the most frequent first; out of the throws that did not
+        fail."""
+        surfaces, n = self.about["surfaces"], self.n - sum(each.count for each in self.failures)
         rows = []
         for kind, count in self.sums.itineraries.items():
-            rows.append(Frequency(tuple(surfaces[i] for i in kind), count, *probability(count, self.n)))
+            rows.append(Frequency(tuple(surfaces[i] for i in kind), count, *probability(count, n)))
         return rows
 
     @property
@@ -117,6 +134,12 @@ class Ensemble:
         """How the motions ended, by name of `RESULTS`."""
         pairs = zip(NAMES_OF_RESULTS, self.sums.results, strict=True)
         return [Frequency(name, int(count), *probability(int(count), self.n)) for name, count in pairs if count]
+
+    @property
+    def failures(self) -> list[Frequency]:
+        """Those of the results that are failures: their throws are in no number but these."""
+        fine = [NAMES_OF_RESULTS[code] for code in NO_FAILURES]
+        return [each for each in self.results if each.what not in fine]
 
     def to_xarray(self) -> Any:
         """An `xarray.Dataset` with the dimensions quantity, level, bin, edge, itinerary and result."""

@@ -2,7 +2,7 @@
 
 import functools
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._math import KINDS, NO_IMPACTS, along, frozen, root, shared
-from .._motion import ImpactLog, Trajectory
+from .._math import KINDS, NO_IMPACTS, along, frozen, is_failure, root, shared
+from .._motion import ImpactLog, Trajectory, flat
 from .._questions import as_point
 
 _SAMPLES = 17  # of an arc, of which the nearest begins Newton's method
@@ -53,6 +53,11 @@ def quantities_of(measures: Mapping[str, Any], shapes: Sequence[Any]) -> tuple[l
         letters = ("x", "y", "z") if shape.shape[0] == 3 else tuple(map(str, range(shape.shape[0])))
         found += [Quantity(f"{name}.{letter}", unit, event) for letter in letters]
     return found, tuple(pairs)
+
+
+def measured(measures: Iterable[Any], trajectory: Trajectory) -> Float[Array, " q"]:
+    """All that is measured of one trajectory. NaN where that failed: its `final` is where it stopped, not its end."""
+    return jnp.where(is_failure(trajectory.result), jnp.nan, flat(measures, trajectory))
 
 
 def struck(log: ImpactLog) -> Any:

@@ -14,10 +14,10 @@ import numpy as np
 from tqdm import tqdm
 
 from .._math import NAMES_OF_RESULTS, WIDEST_VECTORS, by_tiles, over_devices, with_options
-from .._motion import AbstractMotion, checked, flat, simulate
+from .._motion import AbstractMotion, checked, simulate
 from .._world import BallState, Scene
-from .ensemble import Ensemble
-from .measure import AbstractMeasure, ImpactCount, quantities_of, struck
+from .ensemble import Ensemble, warn_of_failures
+from .measure import AbstractMeasure, ImpactCount, measured, quantities_of, struck
 from .sampler import SOBOL_MOST, Sampler, halves, uniforms
 from .statistics import Frame, Sums, Totals, frame_of, means, sums_of
 from .store import Store
@@ -80,7 +80,8 @@ def monte_carlo(
         number of devices or processes.
     - `n`: how many throws, >= 1; `key`: a JAX key, or a whole number.
     - `measures`: by name, `Landing`, `Returns`, ... or any function of a `Trajectory`; see `AbstractMeasure`.
-        Itineraries and results are always counted. Default: the number of impacts.
+        Itineraries and results are always counted. Default: the number of impacts. Throws that failed are left out of
+        every number; a `UserWarning` counts them, and `Ensemble.failures` names them.
     - `itinerary_length`: how many impacts of an itinerary count, and how many rows of the log a measure sees.
     - `t1`, `t0`, `max_impacts`, `motion`, `accuracy`, `sum_trains`: as in `simulate`.
     - `chunk`: throws that are in memory at once (default: between 1,024 and 16,384, so that there are some 32 chunks).
@@ -116,7 +117,9 @@ def monte_carlo(
     study.check_names(standard_error, records, record_where)
     run = study.description(records, record_where)
     store = None if out is None else Store(out, run)
-    return _Runner(study, store, seconds, standard_error, records, record_where, progress).run(resume)
+    found = _Runner(study, store, seconds, standard_error, records, record_where, progress).run(resume)
+    warn_of_failures({each.what: each.count for each in found.failures}, found.n)
+    return found
 
 
 def _check_counts(**counts: Any) -> None:
@@ -201,6 +204,7 @@ class _Study:
             "sources": list(self.sampler.sources(self.scene)) if self.is_table else [],
             "surfaces": list(self.scene.names),
             "quantities": [list(each) for each in self.quantities],
+            "failures": "left out",
             "records": None if records is None else "all" if records == "all" else _as_list(records),
             "record_where": where,
             "versions": versions,
@@ -279,7 +283,7 @@ def _chunk_of(plan: _Plan, scene, sampler, key, motion, t0, t1, lanes) -> _Found
                 u = uniforms(key, lane, (sampler.n_uniform(scene),), sampler.throw.position.dtype)
             inputs, room, state = _drawn(scene, sampler, key, u)
         trajectory = simulate(room, state, t0=t0, t1=t1, motion=motion, throw=False, **options)
-        values = flat(plan.measures, trajectory)
+        values = measured(plan.measures, trajectory)
         code = jnp.asarray(trajectory.result._value, dtype=jnp.int32)
         log = trajectory.impacts
         hits = jnp.where(struck(log), log.surface, -1).astype(jnp.int16)
@@ -370,7 +374,7 @@ class _Runner:
     def _reduce(self, k: int, found: _Found) -> None:
         inputs, values, hits, results = (np.asarray(x) for x in found)
         start = k * self.study.chunk
-        sums = sums_of(self.frame, values.astype(float), hits, results, len(NAMES_OF_RESULTS), start)
+        sums = sums_of(self.frame, values.astype(float), hits, results, start)
         if self.store is not None:
             self.store.save(k, sums, self._table(start, inputs, values, hits, results))
         self.held = sums if k == self.reached else None
@@ -386,7 +390,8 @@ class _Runner:
         columns: dict[str, Any] = {"throw": np.arange(start, start + len(values), dtype=np.int64)[keep]}
         columns |= {name: inputs[keep, i] for i, name in enumerate(self.study.inputs)}
         for i, each in enumerate(self.study.quantities):
-            columns[each.name] = values[keep, i] == 1 if each.event else values[keep, i]
+            column = values[keep, i]
+            columns[each.name] = pa.array(column == 1, mask=np.isnan(column)) if each.event else column
         surfaces = np.array([*self.study.scene.names, ""], dtype=object)
         columns["itinerary"] = [" ".join(surfaces[row[row >= 0]]) for row in hits[keep]]
         columns["result"] = np.array(NAMES_OF_RESULTS, dtype=object)[results[keep]]

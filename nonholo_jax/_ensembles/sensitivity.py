@@ -8,11 +8,19 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
-from .._math import LEAST_EFFORT, WIDEST_VECTORS, by_tiles, surfaces_hit, with_options
+from .._math import (
+    LEAST_EFFORT,
+    NAMES_OF_RESULTS,
+    NO_FAILURES,
+    WIDEST_VECTORS,
+    by_tiles,
+    surfaces_hit,
+    with_options,
+)
 from .._motion import AbstractMotion, checked, flat, simulate
 from .._world import Scene
-from .ensemble import Ensemble
-from .measure import quantities_of
+from .ensemble import Ensemble, warn_of_failures
+from .measure import measured, quantities_of
 from .sampler import Sampler, halves, uniforms
 
 _CHUNK = 4096
@@ -49,9 +57,10 @@ class Propagation(NamedTuple):
         length = max((len(each.what) for each in found.itineraries), default=0)
         same = sum(each.count for each in found.itineraries if each.what == self.itinerary[:length])
         way = " ".join(self.itinerary) or "no impact"
-        others = f"{1.0 - same / found.n:.2%} of the throws take other ways than the central one ({way})"
+        n = found.n - sum(each.count for each in found.failures)
+        others = f"{1.0 - same / n:.2%} of the throws take other ways than the central one ({way})"
         curved = f"all take the way of the central one ({way}), but the map from inputs to this is curved"
-        reason = curved if same == found.n else others
+        reason = curved if same == n else others
         lines, rounding = [], 1e-9 * float(np.abs(self.mean).max(initial=0.0))
         for i, name in enumerate(self.names):
             mean, error, spread = found.mean(name), found.standard_error(name), found.standard_deviation(name)
@@ -81,7 +90,7 @@ def propagate(
 
     Returns a `Propagation`, whose `against(found)` says where a study disagrees. It does where the map is curved over
     the spread of the inputs, and where some throws take another itinerary, of which a derivative knows nothing. Raises
-    `ValueError` as `monte_carlo` does.
+    `ValueError` as `monte_carlo` does, and `SimulationError` where the central throw fails.
 
     ```python
     from nonholo_jax import Ball, BallState, Landing, Normal, Plane, Rough, Sampler, Scene, Vary, propagate
@@ -94,14 +103,14 @@ def propagate(
     """
     inputs = sampler.names(scene)
     motion, rows = checked(scene, motion, max_impacts, min(itinerary_length, max_impacts), sum_trains)
-    options = {"t0": t0, "t1": t1, "max_impacts": max_impacts, "log_size": rows, "motion": motion, "throw": False}
+    options = {"t0": t0, "t1": t1, "max_impacts": max_impacts, "log_size": rows, "motion": motion}
     center, spread = sampler.moments(scene)
     values = jnp.asarray(center, dtype=sampler.throw.position.dtype)
 
-    def run(values: Any) -> Any:
-        return simulate(*sampler.applied(scene, values), sum_trains=sum_trains, **options)
+    def run(values: Any, throw: bool = False) -> Any:
+        return simulate(*sampler.applied(scene, values), sum_trains=sum_trains, throw=throw, **options)
 
-    trajectory = run(values)
+    trajectory = run(values, throw=True)
     shapes = jax.eval_shape(lambda: [jnp.asarray(measure(trajectory)) for measure in measures.values()])
     smooth = {name: m for (name, m), shape in zip(measures.items(), shapes, strict=True) if shape.dtype != bool}
     quantities, _ = quantities_of(smooth, [shape for shape in shapes if shape.dtype != bool])
@@ -142,7 +151,8 @@ def expectation(
     **Arguments:**
 
     - `build`: a function of `parameters`, any pytree of JAX arrays, that returns a `Scene` and a `Sampler`.
-    - `measure`: as in `monte_carlo`, of one number that is no event. Throws in which it is not there are left out.
+    - `measure`: as in `monte_carlo`, of one number that is no event. Throws in which it is not there are left out, and
+        so are those that failed, which a `UserWarning` counts.
     - the rest as in `monte_carlo`.
 
     Returns an `Expectation`. Where a small change of the parameters changes which throws take which itinerary, and the
@@ -168,15 +178,18 @@ def expectation(
     sampler.names(scene)
     motion, rows = checked(scene, motion, max_impacts, min(itinerary_length, max_impacts), sum_trains)
     options = {"max_impacts": max_impacts, "log_size": rows, "motion": motion, "sum_trains": sum_trains}
-    count, first, second, shift = 0, 0.0, 0.0, None
+    count, first, second, shift, results = 0, 0.0, 0.0, None, np.zeros(len(NAMES_OF_RESULTS), int)
     for start in range(0, n, _CHUNK):
         index = np.minimum(np.arange(start, start + _CHUNK, dtype=np.int64), n - 1)
         found = _slopes(build, measure, parameters, key, t0, t1, options, halves(index))
-        values = np.asarray(found, dtype=float)[: min(_CHUNK, n - start)]
-        values = values[np.isfinite(values[:, 0])]
+        rows = np.asarray(found, dtype=float)[: min(_CHUNK, n - start)]
+        results += np.bincount(rows[:, 0].astype(int), minlength=len(NAMES_OF_RESULTS))
+        values = rows[np.isfinite(rows[:, 1]), 1:]
         shift = values[0] if shift is None and len(values) else shift  # sums of squares keep their digits
         moved = values if shift is None else values - shift
         count, first, second = count + len(values), first + moved.sum(axis=0), second + (moved**2).sum(axis=0)
+    results[NO_FAILURES] = 0
+    warn_of_failures({NAMES_OF_RESULTS[code]: int(results[code]) for code in np.flatnonzero(results)}, n)
     with np.errstate(all="ignore"):
         mean = np.asarray(first / np.float64(count))
         error = np.sqrt(np.maximum(second / np.float64(count) - mean**2, 0.0) / np.float64(count - 1))
@@ -189,17 +202,19 @@ def expectation(
 def _slopes_of(
     build: Callable, measure: Callable, parameters: Any, key: Any, t0: Any, t1: Any, options: dict, lanes: Any
 ):
-    """The value and its slopes of each of some throws."""
+    """Of each of some throws the code of its result, the value and its slopes."""
 
     def one(lane: Any) -> Any:
         def value(parameters: Any) -> Any:
             scene, sampler = build(parameters)
             u = uniforms(key, lane, (sampler.n_uniform(scene),), sampler.throw.position.dtype)
             room, state = sampler.applied(scene, sampler.values(scene, u))
-            return measure(simulate(room, state, t0=t0, t1=t1, throw=False, **options))
+            trajectory = simulate(room, state, t0=t0, t1=t1, throw=False, **options)
+            return measured([measure], trajectory)[0], jnp.asarray(trajectory.result._value, trajectory.t1.dtype)
 
-        number, slopes = jax.value_and_grad(value)(parameters)
-        return jnp.concatenate([number[None], jax.flatten_util.ravel_pytree(slopes)[0].astype(number.dtype)])
+        (number, result), slopes = jax.value_and_grad(value, has_aux=True)(parameters)
+        slopes = jax.flatten_util.ravel_pytree(slopes)[0].astype(number.dtype)
+        return jnp.concatenate([jnp.stack([result, number]), slopes])
 
     return by_tiles(jax.vmap(one), lanes, lanes[0].shape[0], options["motion"].tile)
 

@@ -4,6 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._math import NAMES_OF_RESULTS, NO_FAILURES
+
 N_BINS = 64
 _SKETCH = 1000  # centroids of a t-digest: the level of a quantile is then good to 1e-3 (test_montecarlo.py)
 
@@ -57,10 +59,9 @@ def frame_of(values: np.ndarray, pairs: tuple, events: tuple) -> Frame:
     return Frame(np.array(shift), np.array(edges).reshape(-1, N_BINS + 1), pairs, events)
 
 
-def sums_of(
-    frame: Frame, values: np.ndarray, hits: np.ndarray, results: np.ndarray, n_results: int, start: int
-) -> Sums:
-    """Of throws `start` and following: `values` (n, q), `hits` (n, rows) indices or -1, `results` (n,) codes."""
+def sums_of(frame: Frame, values: np.ndarray, hits: np.ndarray, results: np.ndarray, start: int) -> Sums:
+    """Of throws `start` and following: `values` (n, q), `hits` (n, rows) indices or -1, `results` (n,) codes. What a
+    throw hit before it failed is no itinerary."""
     n, q = values.shape
     there = np.isfinite(values)
     mask, moved = there.astype(float), np.where(there, values - frame.shift, 0.0)
@@ -77,8 +78,8 @@ def sums_of(
         highest.max(axis=0, initial=-np.inf),
         start + at[0],
         start + at[1],
-        np.bincount(results, minlength=n_results).astype(np.int64),
-        _counted(hits),
+        np.bincount(results, minlength=len(NAMES_OF_RESULTS)).astype(np.int64),
+        _counted(hits[np.isin(results, NO_FAILURES)]),
         tuple(_sketch(values[there[:, i] & (not frame.events[i]), i]) for i in range(q)),
     )
 

@@ -32,7 +32,8 @@ class Fit(NamedTuple):
       the data say nothing of a number.
     - `scene`: with the values. `residuals` (n, m): measured less computed, in units of `spread`, NaN if there is none.
     - `spread`: the standard deviation of a measurement: as given, or estimated from the residuals.
-    - `n_measured`; `criterion`: Akaike's, corrected for few data (AICc); lower is better.
+    - `n_measured`; `criterion`: Akaike's, corrected for few data (AICc), with all constants of the likelihood; lower is
+      better. `is_spread_known`: whether the spread was given.
     """
 
     names: tuple[str, ...]
@@ -44,6 +45,7 @@ class Fit(NamedTuple):
     spread: float | np.ndarray
     n_measured: int
     criterion: float
+    is_spread_known: bool
 
     def report(self) -> list[str]:
         """A line for every number."""
@@ -204,9 +206,11 @@ def _summary(scene, throw, names, values, misses, there, slopes, spread) -> Fit:
     if spread is None:
         scale = math.sqrt(square / (count - d))
         parameters = d + 1  # the spread is one more
-        criterion = count * math.log(max(square, 1e-300) / count)
+        criterion = count * (math.log(2.0 * math.pi * max(square, 1e-300) / count) + 1.0)
     else:
-        scale, parameters, criterion = 1.0, d, square
+        sizes = np.broadcast_to(np.asarray(spread, dtype=float), there.shape)[there]
+        scale, parameters = 1.0, d
+        criterion = square + float(np.log(2.0 * math.pi * sizes**2).sum())
     free = count - parameters - 1
     criterion += 2.0 * parameters + (2.0 * parameters * (parameters + 1) / free if free > 0 else math.inf)
     kept, lengths = slopes[there.ravel()], np.linalg.norm(slopes[there.ravel()], axis=0)
@@ -224,6 +228,7 @@ def _summary(scene, throw, names, values, misses, there, slopes, spread) -> Fit:
         spread=scale if spread is None else np.asarray(spread, dtype=float),
         n_measured=count,
         criterion=criterion,
+        is_spread_known=spread is not None,
     )
 
 
@@ -242,7 +247,7 @@ def compare(fits: Mapping[str, Fit]) -> Preference:
     **Arguments:** `fits` of the same data, by name; at least two.
 
     Returns a `Preference`: the model of the lowest criterion, or `"undecided"` where another comes within 2. Raises
-    `ValueError` for fewer than two fits, or of different data.
+    `ValueError` for fewer than two fits, or of different data, or where the spread was given to some only.
 
     ```python
     from nonholo_jax import compare, fit
@@ -253,6 +258,11 @@ def compare(fits: Mapping[str, Fit]) -> Preference:
         raise ValueError(f"Argument `fits` must hold at least two, but got {len(fits)}; try another law.")
     if len({each.n_measured for each in fits.values()}) > 1:
         raise ValueError("Argument `fits` must be of the same data, but they differ in how much was measured.")
+    known = [name for name, each in fits.items() if each.is_spread_known]
+    if known and len(known) < len(fits):
+        other = next(name for name in fits if name not in known)
+        what = f"must all have a given `spread` or none, but {known[0]!r} was given one and {other!r} estimated it"
+        raise ValueError(f"Argument `fits` {what}; try fit(..., spread=...) for each.")
     best = min(each.criterion for each in fits.values())
     apart = {name: each.criterion - best if each.criterion < math.inf else math.inf for name, each in fits.items()}
     parts = {name: math.exp(-0.5 * x) for name, x in apart.items()}

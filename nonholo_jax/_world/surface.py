@@ -1,6 +1,7 @@
 """Surfaces: where they are, which way they face, and bounds that let a crossing be found without passing it."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -191,14 +192,28 @@ class Plane(AbstractSurface):
         return [nonzero("normal", self.facing)]
 
 
+def _depends_on_time(gap: Callable) -> bool:
+    """Whether a gap at two times is two gaps to JAX. Says nothing of a gap that fails: whoever calls it will hear."""
+    x, t = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((3,), (2,)))
+    try:
+        jax.eval_shape(jax.vmap(gap, in_axes=(None, 0)), x, t)
+    except Exception:
+        return False
+    try:
+        jax.eval_shape(jax.vmap(gap, in_axes=(None, 0), out_axes=None), x, t)
+    except ValueError:
+        return True
+    return False
+
+
 class Implicit(AbstractSurface):
     """Any surface, given as the zeros of a smooth function of the ball's centre.
 
     **Arguments:**
 
     - `function`: `gap(x, t)` of the ball's centre x (shape (3,), in m) at time t, in m: positive apart, zero at
-        contact; it need not be a distance, but its gradient must not vanish at contact. It must not depend on t in
-        this version. It may be an `equinox.Module` whose fields are traced.
+        contact; it need not be a distance, but its gradient must not vanish at contact. It may be an
+        `equinox.Module` whose fields are traced. Raises `ValueError` if it depends on t: surfaces do not move yet.
     - `law` of contact.
     - `curvature`: a bound in 1/m of the norm of the second derivative of the function. With it no crossing is ever
         passed. Without it `Exact` refuses the surface; `Integrated` then bounds the second derivative along each step
@@ -220,6 +235,9 @@ class Implicit(AbstractSurface):
         self.function = gap if isinstance(gap, eqx.Module) else jax.tree_util.Partial(gap)
         self.law = law
         self.curvature = as_number(curvature)
+        if _depends_on_time(gap):
+            what = "must not depend on the time t, but does: surfaces do not move yet"
+            raise ValueError(f"Argument `gap` {what}; try a scene for each of its positions.")
         check(self)
 
     def distance(self, x, t):

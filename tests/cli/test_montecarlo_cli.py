@@ -86,6 +86,21 @@ def test_one_json_object_store_and_picture(scene, tmp_path, capsys):
     assert error == "" and "600 throws" in text and "near" in text and "itineraries" in text
 
 
+def test_throws_that_failed_are_counted_and_named(tmp_path, monkeypatch, capsys):
+    """A restitution of 0.8 with a spread of 0.2 is above 1 in one throw of six."""
+    monkeypatch.chdir(tmp_path)
+    text = GOOD.replace('names = ["velocity"]', 'names = ["surfaces.floor.law.restitution"]')
+    path = written(tmp_path, text.replace("std = [0.1, 0.1, 0.2]", "std = 0.2"))
+    assert main(["montecarlo", path, "--json", "--out", "one"]) == 0
+    out, error = capsys.readouterr()
+    answer = json.loads(out)
+    failed = answer["failures"]["invalid_state"]
+    assert error == "" and 50 < failed < 150 and answer["quantities"]["landing.x"]["present"] == 600 - failed
+    assert main(["montecarlo", path, "--out", "two", "--no-plot"]) == 0
+    out, error = capsys.readouterr()
+    assert error == "" and f"warning: {failed} of 600 throws failed (invalid_state {failed})" in out
+
+
 def test_first_order_stands_beside_the_answer(scene, capsys):
     """A drop bounces back: its landing is linear in the horizontal velocity, and the spread of that is 0.1 m/s."""
     command = ["montecarlo", scene, "--first-order", "--chunk", "200", "--no-plot"]

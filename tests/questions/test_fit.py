@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from nonholo_jax import Ball, BallState, Frictional, Plane, Rough, Scene, compare, fit, simulate_batch
 
@@ -59,6 +60,25 @@ def test_standard_errors_are_the_spread_of_repeated_fits():
     assert np.isclose(np.sqrt(np.mean([each.spread**2 for each in found])), noise, rtol=0.15)
     known = run(Rough(0.7, tangential=0.2), exact, ("restitution", "tangential"), spread=noise)
     assert np.allclose(known.standard_errors, errors, rtol=0.1)
+
+
+def test_the_criterion_is_that_of_the_normal_distribution():
+    """AICc by SciPy's density, constants included: a given spread that is wrong loses against the right one, and fits
+    of which only some were given a spread have no common measure."""
+    data = measured(Rough(0.76)) + 0.05 * np.random.default_rng(2).standard_normal((4, 3))
+    fits = {str(size): run(Rough(0.7), data, ["restitution"], spread=size) for size in (0.05, 0.5, 0.005)}
+    fits["each"] = run(Rough(0.7), data, ["restitution"], spread=np.full((4, 3), 0.05))
+    estimated = run(Rough(0.7), data, ["restitution"])
+    for each, d in [*((each, 1) for each in fits.values()), (estimated, 2)]:
+        misses = each.residuals * each.spread
+        size = each.spread if d == 1 else np.sqrt(np.mean(misses**2))
+        likelihood = norm.logpdf(misses, scale=size).sum()
+        assert each.criterion == pytest.approx(2 * d - 2 * likelihood + 2 * d * (d + 1) / (12 - d - 1), rel=1e-12)
+    apart = compare(fits).differences
+    assert abs(apart["0.05"]) < 1e-9 and abs(apart["each"]) < 1e-9 and min(apart["0.5"], apart["0.005"]) > 10
+    for mixed in ({"known": fits["0.05"], "not": estimated}, {"not": estimated, "known": fits["each"]}):
+        with pytest.raises(ValueError, match="'known' was given one and 'not' estimated it"):
+            compare(mixed)
 
 
 def test_laws_are_preferred_only_where_the_data_tell():
