@@ -1,7 +1,6 @@
 """Surfaces: where they are, which way they face, and bounds that let a crossing be found without passing it."""
 
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -192,7 +191,7 @@ class Plane(AbstractSurface):
         return [nonzero("normal", self.facing)]
 
 
-def _depends_on_time(gap: Callable) -> bool:
+def _depends_on_time(gap: Any) -> bool:
     """Whether a gap at two times is two gaps to JAX. Says nothing of a gap that fails: whoever calls it will hear."""
     x, t = (jax.ShapeDtypeStruct(shape, jnp.result_type(float)) for shape in ((3,), (2,)))
     try:
