@@ -387,9 +387,10 @@ if coordinator:
 """
 
 
-def run(folder, *more, devices=1, wait=True):
+def run(folder, *more, devices=1, wait=True, effort=0):
     here = os.path.dirname(__file__)
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
+    flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level={effort}"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {flags}"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", SCRIPT.format(here=here), str(folder), *map(str, more)]
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
@@ -442,10 +443,12 @@ def test_one_of_two_processes_dies_and_comes_back(tmp_path):
     same(Ensemble.open(whole), Ensemble.open(folder))
 
 
-def test_two_devices_draw_the_same_throws(tmp_path, kept):
-    assert "done 3000 2" in run(tmp_path / "two", devices=2)
-    found = Ensemble.open(tmp_path / "two")
-    same(kept, found, rtol=1e-10, atol=1e-9)
-    rows, others = table(kept), table(found)
+def test_two_devices_draw_the_same_throws(tmp_path):
+    """Compiled as by default: with less effort, JAX 0.10 rounds otherwise for two devices."""
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert "done 3000 1" in run(one, effort=3) and "done 3000 2" in run(two, devices=2, effort=3)
+    one, two = Ensemble.open(one), Ensemble.open(two)
+    same(one, two, rtol=1e-10, atol=1e-9)
+    rows, others = table(one), table(two)
     for name in SAMPLER.names(SCENE):
         assert np.array_equal(rows[name], others[name])
