@@ -1,5 +1,6 @@
 """Inverse problems: which throw, or which scene, reaches a goal."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._math import LEAST_EFFORT, RESULTS, is_failure, on_cpu, result_name, surfaces_hit
+from .._math import LEAST_EFFORT, RESULTS, along, is_failure, on_cpu, result_name, surfaces_hit
 from .._motion import Trajectory, checked, simulate
 from .._world import BallState, Scene
 from .chart import Chart, chart_of, limits_of
@@ -166,13 +167,36 @@ def design(
 
 
 def _up_to_goal(problem: "_Problem", values: Any, time: Any) -> Trajectory:
-    """The picture and the report end at the goal. Where that is an impact, rounding must not end them before it."""
-    eps = float(jnp.finfo(time.dtype).eps)
+    """The picture and the report end at the goal: where that is an impact, with it. To run again to its time would not
+    do: steps that another end cuts are other steps, and may end before the impact."""
     t1 = np.asarray(problem.t1)
-    later = time + 64.0 * eps * (abs(time) + abs(t1))
-    is_passage = isinstance(problem.goal, AbstractGoal) and problem.goal.passes_after is not None
-    end = time if is_passage else min(later, t1)
-    return problem.trajectory(values, jnp.asarray(end if np.isfinite(end) else t1, t1.dtype), adjoint=None)
+    until = lambda end: problem.trajectory(values, jnp.asarray(end, t1.dtype), adjoint=None)  # noqa: E731
+    if not (isinstance(problem.goal, AbstractGoal) and np.isfinite(time)):
+        return until(t1)
+    if problem.goal.passes_after is not None:
+        return until(time)
+    trajectory = until(t1)
+    times = np.asarray(trajectory.impacts.time)
+    apart = np.where(np.isfinite(times), abs(times - time), np.inf)
+    near = float(np.finfo(t1.dtype).eps) ** 0.5 * (abs(t1) + abs(np.asarray(problem.t0)))
+    return _up_to_row(trajectory, int(apart.argmin())) if apart.min(initial=np.inf) <= near else until(time)
+
+
+def _up_to_row(trajectory: Trajectory, row: int) -> Trajectory:
+    """The motion up to a row of its log, and with it."""
+    log = trajectory.impacts
+    keep = np.arange(len(log.time)) <= row
+
+    def cut(x: Any, unused: Any) -> Any:
+        x = np.asarray(x)
+        return jax.device_put(np.where(along(keep, x), x, np.asarray(unused, x.dtype)))
+
+    kept = jax.tree.map(lambda x: cut(x, np.nan if jnp.issubdtype(x.dtype, np.floating) else 0), log)
+    kept = dataclasses.replace(kept, surface=cut(log.surface, -1), support=cut(log.support, -1))
+    final, t1 = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[row]), (log.after, log.until))
+    n_impacts = jax.device_put(np.asarray(row + 1, log.surface.dtype))
+    parts = {"final": final, "t1": t1, "impacts": kept, "n_impacts": n_impacts}
+    return dataclasses.replace(trajectory, result=RESULTS.reached_t1, **parts)
 
 
 class _Problem(eqx.Module):

@@ -10,8 +10,11 @@ import optax
 import pytest
 
 from nonholo_jax import (
+    Air,
     Ball,
     BallState,
+    Box,
+    Frictional,
     HitTarget,
     Integrated,
     Land,
@@ -58,6 +61,26 @@ def test_velocity_that_lands_on_a_point():
     answer = design(room(), THROW, free=["velocity.x", "velocity.y"], goal=goal, t1=1.0, n_starts=2)
     assert answer.converged
     np.testing.assert_allclose(answer.values, [0.3 / FALL, -0.2 / FALL], rtol=1e-9)
+
+
+@pytest.mark.parametrize("air", [None, Air(1.204, 0.45, 0.6)], ids=["vacuum", "air"])
+def test_an_answer_that_lands_ends_with_its_landing(air):
+    """Run again to the time of the impact, half of the answers with air ended before it: steps that another end cuts
+    are other steps."""
+    table = Box((0.0, 0.0, 0.745), (1.37, 0.7625, 0.015), Frictional(0.876, 0.0, 0.25))
+    scene = Scene(Ball(0.02, 0.0027, 2 / 3), {"table": table}, air=air)
+    throw = BallState([-1.6, 0.3, 1.0], [5.0, -0.6, -1.5], [0.0, 80.0, 20.0])
+    asked = {"free": ["velocity"], "itinerary": ["table", "table"], "t1": 1.2, "max_impacts": 4, "n_starts": 2}
+    for y in (-0.4, -0.2, 0.0, 0.2):
+        answer = design(scene, throw, goal=Land([1.1, y, 0.76]), **asked)
+        end, log = answer.trajectory, answer.trajectory.impacts
+        assert answer.converged and answer.itinerary == ("table", "table") and int(end.n_impacts) == 2
+        np.testing.assert_allclose(log.point[1], [1.1, y, 0.76], atol=1e-6)
+        assert float(end.t1) == float(log.until[1]) and np.array_equal(end.final.velocity, log.after.velocity[1])
+        np.testing.assert_allclose(end.at(end.t1).position, end.final.position, atol=1e-12)
+        assert np.all(log.surface[2:] == -1) and np.all(np.isnan(log.time[2:]))
+        longer = simulate(answer.scene, answer.state, t1=1.2, max_impacts=4, sum_trains=False, throw=False)
+        np.testing.assert_allclose(longer.impacts.time[:2], log.time[:2], rtol=1e-9)
 
 
 def test_velocity_that_hits_a_target_in_flight():
