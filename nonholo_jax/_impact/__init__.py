@@ -1,7 +1,6 @@
 """What an impact does to velocities: the projector, contact laws, corners, trains of bounces, rolling and sliding."""
 
 from . import rolling as rolling, train as train
-from .corner import collide_with_all as collide_with_all, is_one_mu as is_one_mu, rows_of as rows_of
 from .law import AbstractContactLaw as AbstractContactLaw, Frictional as Frictional, Rough as Rough, Smooth as Smooth
 from .projector import (
     accelerate as accelerate,
@@ -14,4 +13,5 @@ from .projector import (
     whiten as whiten,
 )
 from .rolling import along_surface as along_surface
+from .together import Touched as Touched, reflected as reflected, takes_part as takes_part
 from .train import Contact as Contact

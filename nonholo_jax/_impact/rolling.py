@@ -11,7 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from .._math import Number, Vector3, add, cross, dot, norm, plus, ratio, scale, subtract, times, where
+from .._math import Number, Vector3, add, cross, dot, norm, plus, ratio, scale, subtract, where
 
 NONE: Vector3 = (0.0, 0.0, 0.0)
 
@@ -83,28 +83,3 @@ def gripped(
     share = ratio(inertia_ratio, plus(1.0, inertia_ratio))
     velocity = subtract(velocity, scale(share, own_slip(radius, normal, velocity, spin)))
     return velocity, rolling_spin(radius, normal, velocity, spin)
-
-
-def against_rough(
-    radius: Number,
-    inertia_ratio: Number,
-    normal: Vector3,
-    wall: Vector3,
-    mu: Number,
-    velocity: Vector3,
-    spin: Vector3,
-) -> tuple[Vector3, Vector3]:
-    """A rolling ball that stays on its support hits another surface. With c = n x n', d = n - n', the one motion that
-    both contacts allow is v = r c, omega = d: v+ = -mu v + (1 + mu) times its projection on that (4.2), Theorem 5.1."""
-    c, d = cross(normal, wall), subtract(normal, wall)
-    weight = times(inertia_ratio, radius)
-    both = plus(dot(c, velocity), times(weight, dot(d, spin)))
-    share = ratio(times(plus(1.0, mu), both), plus(dot(c, c), times(inertia_ratio, dot(d, d))))
-    kept: Any = scale(times(-1.0, mu), velocity), scale(times(-1.0, mu), spin)
-    return add(kept[0], scale(share, c)), add(kept[1], scale(ratio(share, radius), d))
-
-
-def against_smooth(normal: Vector3, wall: Vector3, mu: Number, velocity: Vector3) -> Vector3:
-    """The velocity of a ball that stays on its support when it hits a smooth surface."""
-    into = along_surface(normal, wall)
-    return subtract(velocity, scale(ratio(times(plus(1.0, mu), dot(into, velocity)), dot(into, into)), into))

@@ -139,6 +139,14 @@ class AbstractBlock(AbstractSurface):
         center, half, axes = self._frame()
         return _box_bend(window, axes, center, half, radius)
 
+    def directions(self):
+        axes = self._frame()[2]
+        return (*axes, *[scale(-1.0, axis) for axis in axes])
+
+    def most(self, n):
+        center, half, axes = self._frame()
+        return plus(dot(n, center), total([times(h, abs(dot(n, axis))) for h, axis in zip(half, axes, strict=True)]))
+
     def extent(self):
         return plus(norm(components(self.center)), norm(components(self.half_size)))
 

@@ -216,7 +216,8 @@ class Grounded(AbstractSystem):
         return Travel(self.scene.bounced(contact, time, state.flight), state.support)
 
     def meets(self, contact, time, state, left, rests, ends):
-        settling, (n, struck) = self._settling, self.scene.struck(contact, time, state.flight)
+        settling = self._settling
+        n, struck, stays = self.scene.struck(contact, time, state.flight, settling.support(state))
         pull = settling.pull(time, struck)
         rise, into, e_n = dot(n, struck.velocity), times(-1.0, dot(n, pull)), self.scene.restitution(contact)
         # Not later than `train.duration`, or nearly.
@@ -227,16 +228,17 @@ class Grounded(AbstractSystem):
             return _as_arrays(bounces(ends, Travel(struck, -1.0)), time)
 
         def unusual() -> Meeting:
-            touch = settling.touch(contact, time, state, n, struck, pull)
+            touch = settling.touch(contact, time, state, n, struck, pull, stays)
             return _as_arrays(settling.meets(touch, left, rests, ends), time)
 
         return _if_any((state.support >= 0) | soon, unusual, plain)
 
     def after(self, contact, time, state, kind):
-        settling, (n, struck) = self._settling, self.scene.struck(contact, time, state.flight)
+        settling = self._settling
+        n, struck, stays = self.scene.struck(contact, time, state.flight, settling.support(state))
 
         def unusual() -> tuple:
-            touch = settling.touch(contact, time, state, n, struck, settling.pull(time, struck))
+            touch = settling.touch(contact, time, state, n, struck, settling.pull(time, struck), stays)
             return _as_arrays(settling.settled(touch, kind, train.summed(*settling.train_of(touch, kind)))[:2], time)
 
         plain = lambda: _as_arrays((Travel(struck, -1.0), 0.0), time)  # noqa: E731

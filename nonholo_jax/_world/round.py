@@ -63,6 +63,12 @@ def round_bend(window: Window, axes: tuple, origin: Vector3, reach: Number, insi
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
+def _lies_across(n: Vector3, axes: tuple) -> bool:
+    """Whether a direction is known to have no part along the axis of a cylinder."""
+    square = total([times(dot(n, axis), dot(n, axis)) for axis in axes])
+    return is_constant(square) and bool(abs(square - dot(n, n)) <= 1e-15)
+
+
 class _AbstractRound(AbstractSurface):
     """What a sphere and a cylinder share: a distance from a middle, across two or three axes."""
 
@@ -102,6 +108,12 @@ class _AbstractRound(AbstractSurface):
     def bend(self, window, t, radius):
         middle, axes = self._frame()
         return round_bend(window, axes, middle, self._reach(radius), self.inside)
+
+    def most(self, n):
+        middle, axes = self._frame()
+        if self.inside or not is_constant(norm(n)) or not _lies_across(n, axes):
+            return None
+        return plus(dot(n, middle), times(norm(n), self.radius))
 
     def extent(self):
         return plus(norm(self._frame()[0]), self.radius)

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .._impact import AbstractContactLaw, collide_with_all, is_one_mu, rows_of
 from .._math import (
     Block,
     Choice,
@@ -34,7 +33,6 @@ from .._math import (
     shared,
     subtract,
     times,
-    total,
     turned,
     where,
 )
@@ -44,6 +42,7 @@ from .box import AbstractBlock, along
 from .stack import Member, Stack, stacked
 from .surface import AbstractSurface, Plane
 from .system import AbstractSystem, bounces, magnitude, rounding
+from .touching import Support, after_all, may_touch_two, touches_two
 
 
 class Flight(NamedTuple):
@@ -182,47 +181,26 @@ class Scene(AbstractSystem):
     def restitution(self, contact: Choice) -> Number:
         return contact.of([surface.law.restitution for surface in self.chosen(contact)])
 
-    def struck(self, contact: Choice, time: Any, state: Flight) -> tuple[Vector3, Flight]:
-        """The normal of a contact, and the state after an impact there: by Theorem 5.2, for any normal and any law; at
-        a corner by (4.2), for all that is hit if that has one mu."""
+    def struck(self, contact: Choice, time: Any, state: Flight, support: Support | None = None) -> tuple:
+        """The normal of a contact, the state after an impact there, and whether a ball is still on its support then: by
+        Theorem 5.2, for any normal and any law; where it touches several surfaces, on all of them."""
         normals = [surface.direction(state.position, time) for surface in self.chosen(contact)]
         n = shared(contact.vector(normals))
-        velocity, spin = self._after(contact, n, state.velocity, state.spin)
-        one_mu = [is_one_mu(_law(each)) for each in self.surfaces]
-        if sum(size for size, alike in zip(self._sizes, one_mu, strict=True) if alike) < 2:
-            return n, state._replace(velocity=velocity, spin=spin)
-        known = contact.among([i for i, alike in enumerate(one_mu) if alike])
-        mu, size = self.restitution(contact), magnitude(state.position)
-
-        def hit_too(member: Member, direction: Vector3 | None = None) -> tuple:
-            """Whether a surface is touched and closed in on when another one is hit that has the same mu, and its
-            normal."""
-            direction, law = direction or member.surface.direction(state.position, time), member.surface.law
-            noise = rounding(self, member, size, time.dtype)
-            touches = abs(self.level(member, time, state.position, state)) <= 16.0 * noise
-            same = True if law.restitution is mu else law.restitution == mu
-            closes = dot(direction, state.velocity) < 0
-            return known & ((contact.index == member.number) | (touches & closes & same)), direction
-
-        every = zip(self.contacts(), normals, one_mu, strict=True)
-        alike, own = zip(*[(each, normal) for each, normal, is_alike in every if is_alike], strict=True)
-        found = [hit_too(each, normal) if isinstance(each, Member) else each[1].each(each[0], hit_too)
-                 for each, normal in zip(alike, own, strict=True)]  # fmt: skip
-        several = total([jnp.sum(where(hit, 1.0, 0.0)) for hit, _ in found]) > 1.5
-
-        def at_corner(_):
-            laws = [_law(each.surface if isinstance(each, Member) else each[1]) for each in alike]
-            rows = [_rows(law, hit, normal, time.dtype) for law, (hit, normal) in zip(laws, found, strict=True)]
-            ball = self.ball
-            return as_arrays(
-                collide_with_all(ball.radius, ball.inertia_ratio, jnp.concatenate(rows), mu, state.velocity, state.spin)
-            )
-
         as_arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=time.dtype), tree)  # noqa: E731
-        both = as_arrays((velocity, spin))
-        corner = lax.cond(eqxi.unvmap_any(several), at_corner, lambda one: one, both)
-        velocity, spin = jax.tree.map(lambda a, b: where(several, a, b), corner, both)
-        return n, state._replace(velocity=velocity, spin=spin)
+        single = self._after(contact, n, state.velocity, state.spin)
+        if not may_touch_two(self.surfaces, self.ball.radius):
+            return n, state._replace(velocity=single[0], spin=single[1]), False
+        several, no = touches_two(self, time, state.position), jnp.asarray(False)
+
+        def on_all(_: Any) -> tuple:
+            unusual, after, stays = after_all(self, time, contact.index, state, support)
+            return unusual, as_arrays(after), stays
+
+        unusual, after, stays = lax.cond(
+            eqxi.unvmap_any(several), on_all, lambda each: (no, each, no), as_arrays(single)
+        )
+        velocity, spin = jax.tree.map(lambda a, b: where(several & unusual, a, b), after, as_arrays(single))
+        return n, state._replace(velocity=velocity, spin=spin), several & stays
 
     def _after(self, contact: Choice, n: Vector3, velocity: Vector3, spin: Vector3, shared: Callable = shared) -> Any:
         """Velocity and spin after an impact on one surface, with the normal there."""
@@ -350,15 +328,3 @@ class Scene(AbstractSystem):
 
     def without_contacts(self) -> "Scene":
         return Scene(self.ball, {}, self.gravity, self.air)
-
-
-def _law(surface: AbstractSurface | Stack) -> AbstractContactLaw:
-    return surface.first.law if isinstance(surface, Stack) else surface.law
-
-
-def _rows(law: AbstractContactLaw, hit: Any, normal: Any, dtype: Any) -> Any:
-    """`rows_of` one surface, or of all that are in a stack."""
-    if jnp.ndim(hit) == 0:
-        return rows_of(law, normal, hit, dtype)
-    each = jnp.stack([jnp.broadcast_to(jnp.asarray(c, dtype), hit.shape) for c in normal], axis=-1)
-    return jax.vmap(lambda n, flag: rows_of(law, components(n), flag, dtype))(each, hit).reshape(-1, 6)

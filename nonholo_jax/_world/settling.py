@@ -35,6 +35,7 @@ from .scene import Flight, Scene
 from .stack import Member, Stack
 from .surface import AbstractSurface, Face
 from .system import Meeting, magnitude, rounding
+from .touching import Support
 
 
 def _can_settle(surface: AbstractSurface) -> bool:
@@ -79,10 +80,6 @@ class Floors:
     def friction(self, contact: Choice) -> Number:
         """The coefficient on that surface; infinite where a ball never slides or never rolls."""
         return self._of(contact, lambda surface: _friction(surface.law))
-
-    def holds(self, contact: Choice) -> Any:
-        """Whether a ball rolls on that surface whatever it meets."""
-        return self._of(contact, lambda surface: _rolls(surface.law) & (_friction(surface.law) == jnp.inf))
 
     def law(self, contact: Choice) -> Contact:
         """What trains need of that surface."""
@@ -157,11 +154,7 @@ class Touch(NamedTuple):
     law: train.Contact
     slips: Any  # whether all impacts of the train slip
     grips: Any  # whether all of them grip
-
-    @property
-    def on(self) -> Any:
-        """Whether the ball was on a face before."""
-        return self.state.support >= 0
+    on: Any  # whether the ball was on a face before, and is not thrown off it
 
 
 class Settling(NamedTuple):
@@ -204,14 +197,23 @@ class Settling(NamedTuple):
         _, a = self.scene.derivative(time, flight, flight.position, flight.velocity)
         return a
 
-    def touch(self, contact: Choice, time: Any, state: Travel, n: Vector3, struck: Flight, pull: Vector3) -> Touch:
-        floors = self.floors
-        floor = self.scene.choice(where(state.support >= 0, phase_of(state), contact.index))
+    def support(self, state: Travel) -> Support:
+        """What the ball stays on, for an impact on something else."""
+        floors, index = self.floors, phase_of(state)
+        floor = self.scene.choice(index)
+        return Support(index, floors.friction(floor) if floors.have_friction else None, floors.rolls(floor))
+
+    def touch(
+        self, contact: Choice, time: Any, state: Travel, n: Vector3, struck: Flight, pull: Vector3, stays: Any
+    ) -> Touch:
+        """`stays` says whether a ball that was on a face before an impact is there afterwards."""
+        floors, on = self.floors, (state.support >= 0) & (stays | (contact.index >= self.scene.n_contacts))
+        floor = self.scene.choice(where(on, phase_of(state), contact.index))
         face, edged = floors.face(floor, state.flight.position, time)
         first = train.start(struck.velocity, struck.spin, face.normal, pull, self.scene.ball.radius)
         law = floors.law(floor)
         slips, grips = self._regime(first, law)
-        return Touch(contact, time, state, n, struck, pull, floor, face, edged, first, law, slips, grips)
+        return Touch(contact, time, state, n, struck, pull, floor, face, edged, first, law, slips, grips, on)
 
     def _regime(self, first: train.Start, law: train.Contact) -> tuple[Any, Any]:
         """Whether all impacts of a train slip, and whether all of them grip."""
@@ -256,16 +258,6 @@ class Settling(NamedTuple):
             calm = False
         return lasts, clear, calm & (touch.slips | touch.grips)
 
-    def _stays(self, touch: Touch) -> Any:
-        """Whether a ball on its support stays on it when it hits a surface: Theorem 5.1 needs one common mu there, and
-        a smooth wall turns the ball round."""
-        rolls, stays = touch.on & self.floors.holds(touch.floor), []
-        for surface in self.scene.chosen(touch.contact):
-            law = surface.law
-            common = bool(law.rolls) and law.sliding_friction() is None and law.reversal() == law.restitution
-            stays.append(rolls & common if law.rolls else law.rolls is False)
-        return touch.contact.of(stays)
-
     def train_of(self, touch: Touch, kind: KINDS) -> tuple:
         """What a train is summed from, in an impact of a known kind: one that lies down does not bounce."""
         first = touch.first
@@ -285,9 +277,8 @@ class Settling(NamedTuple):
 
         # Beside a wall a ball lies down where it is: what it goes during its last bounces could take it through.
         bounce_or_end = KINDS.where(dies_out & clear, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
-        wall = KINDS.where(self._stays(touch), KINDS.rolling, KINDS.bounce)
         over = KINDS.where(grips, KINDS.gripped, KINDS.left)
-        kind = KINDS.where(on, KINDS.where(is_exit, over, wall), bounce_or_end)
+        kind = KINDS.where(on, KINDS.where(is_exit, over, KINDS.rolling), bounce_or_end)
 
         end = train.summed(*self.train_of(touch, kind))
         after, pause, wedged, is_at_rest = self.settled(touch, kind, end)
@@ -318,7 +309,7 @@ class Settling(NamedTuple):
             kind == each for each in (KINDS.train, KINDS.rolling, KINDS.left, KINDS.gripped)
         )
         settles, stays = ~on & (is_train | rolls), on & (rolls | grips)
-        kept = self._against(touch)
+        kept = struck.velocity, struck.spin
         if self.floors.have_friction:
             ball = self.scene.ball
             velocity, spin = rolling.gripped(ball.radius, ball.inertia_ratio, n, flight.velocity, flight.spin)
@@ -347,23 +338,6 @@ class Settling(NamedTuple):
         is_level = (norm(along) <= 64.0 * eps * norm(components(self.scene.gravity))) & (self.scene.air is None)
         return (size(after) <= 64.0 * eps * size(touch.state.flight)) & (is_level | held)
 
-    def _against(self, touch: Touch) -> tuple[Vector3, Vector3]:
-        """Velocity and spin of a ball that stays on its support when it hits another surface; where there is friction
-        it may slip afterwards."""
-        ball, flight, n, wall = self.scene.ball, touch.state.flight, touch.face.normal, touch.normal
-        mu = self.scene.restitution(touch.contact)
-        velocity, spin = rolling.against_rough(
-            ball.radius, ball.inertia_ratio, n, wall, mu, flight.velocity, flight.spin
-        )
-        laws = [surface.law for surface in self.scene.chosen(touch.contact)]
-        if all(law.rolls is not False for law in laws):
-            return velocity, spin
-        smooth = touch.contact.of([law.rolls is False for law in laws])
-        turned = rolling.against_smooth(n, wall, mu, flight.velocity)
-        firm = touch.on & self.floors.holds(touch.floor)
-        carried = where_vector(firm, rolling.rolling_spin(ball.radius, n, turned, flight.spin), flight.spin)
-        return where_vector(smooth, turned, velocity), where_vector(smooth, carried, spin)
-
     def _held(self, touch: Touch) -> tuple[Any, Number]:
         """Whether gravity holds a ball on its support against another surface, into that surface and not along the
         groove between the two; and the acceleration with which it does so."""
@@ -382,12 +356,12 @@ class Settling(NamedTuple):
         noises = [rounding(self.scene, each, size, touch.time.dtype) for each in surfaces]
         creeps = norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin) <= 64.0 * abs(closing)
         small = closing * closing <= 4.0 * pull * touch.contact.of(noises)
-        return held & self._stays(touch) & creeps & small
+        return held & creeps & small
 
     def during(self, contact: Choice, time: Any, state: Travel, elapsed: Any) -> Travel:
         """The state so long after the first impact of a train."""
-        n, struck = self.scene.struck(contact, time, state.flight)
-        touch = self.touch(contact, time, state._replace(support=-1.0), n, struck, self.pull(time, struck))
+        n, struck, _ = self.scene.struck(contact, time, state.flight)
+        touch = self.touch(contact, time, state._replace(support=-1.0), n, struck, self.pull(time, struck), False)
         first, law = touch.first, touch.law
         last = train.bounced(first, law, touch.slips, train.bounces_within(first, law.restitution, elapsed))
         velocity = add(last.velocity, scale(last.rise, first.normal))

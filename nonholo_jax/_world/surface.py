@@ -1,6 +1,7 @@
 """Surfaces: where they are, which way they face, and bounds that let a crossing be found without passing it."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from .._math import (
     components,
     dot,
     gradient_of,
+    is_constant,
     norm,
     pack,
     plus,
@@ -107,6 +109,15 @@ class AbstractSurface(eqx.Module):
         """How far at least the centre of a ball at `x` can go in any direction before it touches, in m."""
         return plus(self.distance(x, t), times(-1.0, radius))
 
+    def directions(self) -> Sequence[Vector3]:
+        """Directions along which this surface may be apart from others."""
+        return ()
+
+    def most(self, n: Vector3) -> Number | None:
+        """The most of n . x over all that is on or behind the surface, in m; `None` where it is infinite or unknown."""
+        del n
+        return None
+
     def is_bounded(self) -> bool:
         """Whether `bend` is a true bound, not an estimate from samples."""
         return getattr(self, "curvature", 0.0) is not None
@@ -183,6 +194,14 @@ class Plane(AbstractSurface):
 
     def bend(self, window, t, radius):
         return window.along(unit(components(self.facing)), (0.0, 0.0, 0.0)).bend
+
+    def directions(self):
+        return (unit(components(self.facing)),)
+
+    def most(self, n):
+        facing = unit(components(self.facing))
+        known = all(is_constant(c) for c in (*n, *facing))
+        return dot(n, components(self.point)) if known and tuple(n) == tuple(facing) else None
 
     def extent(self):
         return norm(components(self.point))

@@ -1,0 +1,243 @@
+"""A ball that touches several surfaces at one instant: which of them take part in the impact, and what it does.
+
+Which. Let v0 be the velocity of the centre that is nearest to v among those that close on nothing touched (Moreau's
+projection). The surfaces that it loads take part; and the support of a ball that rolls or slides, if n . v0 = 0 there.
+
+What. In the coordinates y = (v, sqrt(alpha) r omega), in which the metric is the identity, let P_n project on the
+normals of the set and P on all that its contact points may not do. If all have one law, y+ = y - (1 + e_n) P_n y -
+(1 + e_t) (P - P_n) y, which is (4.2) for e_n = e_t. If not, every normal velocity is reversed by its own e_n, and the
+impulse that stops all slips, the shortest one, is multiplied surface by surface by what that one's law says. A support
+is the paper's A: all of this happens within its kernel, and it takes what it has to, up to its friction.
+"""
+
+import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from .._math import Number, Vector3, components, root
+from .projector import matmul
+
+
+class Touched(NamedTuple):
+    """Surfaces side by side, with an axis of K in front."""
+
+    normals: Any  # (K, 3)
+    takes_part: Any  # whether it is touched, or, for an impact, whether it takes part
+    is_support: Any
+    restitution: Any
+    reversal: Any  # e_t, 0 where the law has no such number
+
+
+def loaded(touched: Touched, velocity: Any) -> tuple[Any, Any]:
+    """Which of the surfaces Moreau's projection of a velocity, shape (3,), loads, and that projection. All ways to load
+    one to three surfaces are tried: which of them are right depends on no order, and where several are, the load can be
+    shared, and all that share it count."""
+    normals, present, count = touched.normals, touched.takes_part, touched.normals.shape[0]
+    eps = float(jnp.finfo(velocity.dtype).eps)
+    ways = [way for size in (1, 2, 3) for way in itertools.combinations(range(count), size)]
+    picked = np.array([[i in way for i in range(count)] for way in ways])
+    slots = np.array([[[i == j for i in range(count)] for j in (*way, *[count] * (3 - len(way)))] for way in ways])
+    closing = -matmul(normals, velocity)
+
+    def one(picked: Any, slots: Any) -> tuple:
+        """The loads of one way, the velocity after them, and by how much they are wrong."""
+        rows = matmul(slots, normals)  # (3, 3), zeros where fewer are loaded
+        fill = jnp.diag(1.0 - jnp.sum(slots, axis=1))
+        a, b, c = matmul(rows, rows.T) + fill
+        adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
+        size = matmul(a, adjugate[0])
+        load = matmul(matmul(slots, closing), adjugate) / jnp.where(size > 64.0 * eps, size, 1.0)
+        each = matmul(load, slots)
+        after = velocity + matmul(each, normals)
+        into = jnp.where(present, -matmul(normals, after), 0.0)
+        possible = (size > 64.0 * eps) & jnp.all(present | ~picked)
+        return each, after, jnp.where(possible, jnp.max(jnp.maximum(into, -each)), jnp.inf)
+
+    each, after, violation = jax.vmap(one)(picked, slots.astype(velocity.dtype))
+    best = jnp.argmin(violation)
+    small = 64.0 * eps * jnp.sqrt(jnp.sum(velocity * velocity))
+    shares = violation <= jnp.maximum(small, violation[best])
+    counts = jnp.any(shares[:, None] & (each > small), axis=0)
+    # What closes by rounding alone is loaded by nothing but that; an impact is of it all the same.
+    counts = jnp.where(jnp.any(counts), counts, jnp.any(shares[:, None] & (each > 0), axis=0))
+    closes = jnp.any(present & (closing > 0))
+    return closes & counts, jnp.where(closes, after[best], velocity)
+
+
+def takes_part(touched: Touched, velocity: Any) -> tuple[Any, Any]:
+    """Which of the touched surfaces take part in an impact, and whether the support is one of them."""
+    counts, nearest = loaded(touched, velocity)
+    eps = float(jnp.finfo(velocity.dtype).eps)
+    size = jnp.sqrt(jnp.sum(velocity * velocity))
+    stays = touched.is_support & (abs(matmul(touched.normals, nearest)) <= 64.0 * eps * size)
+    return counts | stays, jnp.any(stays)
+
+
+def reflected(
+    radius: Number,
+    inertia_ratio: Number,
+    touched: Touched,
+    slip_factors: Callable,
+    has_caps: bool,
+    friction: Number | None,
+    grips: Any,
+    velocity: Vector3,
+    spin: Vector3,
+) -> tuple[Vector3, Vector3]:
+    """Velocity and spin after an impact on all surfaces that take part.
+
+    **Arguments:** `slip_factors(closing, slip_squared)`: the factors s of all laws, as a single impact has them;
+    `has_caps`: whether some of these are less than a gripping contact would have; `friction`: of the support, `None` if
+    it is infinite or zero, as `grips` says.
+    """
+    y, stretch = _whitened(radius, inertia_ratio, velocity, spin)
+    share = jnp.asarray(inertia_ratio / (1.0 + inertia_ratio), y.dtype)
+    set_ = _Set(*_rows(touched.normals, stretch[3]), touched, slip_factors, has_caps, share, inertia_ratio)
+    grips = jnp.asarray(grips).astype(y.dtype)
+    if friction is None:
+        after = _within(set_, y, grips)[0]
+    else:
+        ends = jax.vmap(lambda grip: _within(set_, y, grip))(jnp.arange(2.0, dtype=y.dtype))
+        (free, gripping), (lighter, heavier), (_, needed) = ends
+        after = free + _held(friction, grips, lighter, heavier, needed * root(share)) * (gripping - free)
+    after = after / stretch
+    return components(after[:3]), components(after[3:] / radius)  # pyright: ignore[reportReturnType]
+
+
+def _held(friction: Number, grips: Any, lighter: Any, heavier: Any, needed: Any) -> Any:
+    """How far friction goes towards holding a ball on its support: its pressure there goes from `lighter`, without
+    friction, to `heavier`, where it is enough for what is `needed`. All or nothing where friction is infinite."""
+    coefficient = jnp.where(jnp.isinf(friction), 0.0, friction)
+    slips = needed > coefficient * heavier
+    rest = needed - coefficient * (heavier - lighter)
+    part = jnp.where(slips, coefficient * lighter / jnp.where(slips, rest, 1.0), 1.0)
+    return jnp.where(jnp.isinf(friction), grips, part)
+
+
+class _Set(NamedTuple):
+    normals: Any  # (K, 6)
+    tangents: Any  # (K, 2, 6), of unit length
+    touched: Touched
+    slip_factors: Callable
+    has_caps: bool
+    share: Any
+    inertia_ratio: Any
+
+
+def _whitened(radius: Number, inertia_ratio: Number, velocity: Vector3, spin: Vector3) -> tuple[Any, Any]:
+    v = jnp.stack([jnp.asarray(x) for x in velocity])
+    turn = radius * jnp.stack([jnp.asarray(w, dtype=v.dtype) for w in spin])
+    weight = root(jnp.asarray(inertia_ratio, dtype=v.dtype))
+    stretch = jnp.concatenate([jnp.ones(3, v.dtype), jnp.full(3, 1.0, v.dtype) * weight])
+    return stretch * jnp.concatenate([v, turn]), stretch
+
+
+def _rows(normals: Any, weight: Any) -> tuple[Any, Any]:
+    """The normal velocity and two components of the slip of every surface, as unit rows on y."""
+    x, y, z = (normals[:, i] for i in range(3))
+    sign = jnp.where(z >= 0, 1.0, -1.0)
+    a = -1.0 / (sign + z)  # two tangents without a singular direction: Duff et al., J. Comput. Graph. Tech. 6(1), 2017
+    first = jnp.stack([1.0 + sign * x * x * a, sign * x * y * a, -sign * x], axis=-1)
+    second = jnp.cross(normals, first)
+    tangents = jnp.stack([first, second], axis=1)
+    turned = -jnp.stack([second, -first], axis=1) / weight
+    rows = jnp.concatenate([tangents, turned], axis=-1) / root(1.0 + 1.0 / (weight * weight))
+    return jnp.concatenate([normals, jnp.zeros_like(normals)], axis=-1), rows
+
+
+def _within(set_: _Set, y: Any, grip: Any) -> tuple[Any, Any, Any]:
+    """The impact of a ball whose support may not slip (`grip` is 1) or has no friction (0): y afterwards, the impulse
+    that presses the ball on its support, and the one that keeps it from slipping there, in units of y."""
+    touched, others = set_.touched, (set_.touched.takes_part & ~set_.touched.is_support)[:, None]
+    held = (touched.takes_part & touched.is_support)[:, None]
+    n_held = jnp.sum(jnp.where(held, set_.normals, 0.0), axis=0, keepdims=True)
+    t_held = jnp.sum(jnp.where(held[:, :, None], set_.tangents, 0.0), axis=0)
+    fixed = jnp.concatenate([n_held, grip * t_held])  # (3, 6), of unit length or zero
+    free = lambda x: x - matmul(matmul(x, fixed.T), fixed)  # noqa: E731
+    begin = free(y)
+
+    normal = free(jnp.where(others, set_.normals, 0.0))
+    inverse = _pseudo_inverse(normal)
+    closing = matmul(normal, begin)
+    push = matmul(inverse, (1.0 + touched.restitution) * closing)
+    scale = _at_most_elastic(begin, push)
+    load = -scale * matmul(inverse.T, push)
+    sliding = begin - matmul(inverse, closing)
+
+    rows = free(jnp.where(others[:, :, None], set_.tangents, 0.0).reshape(-1, 6))
+    rows = (rows - matmul(matmul(rows, inverse), normal)).reshape(-1, 2, 6)
+    kick = _kicks(set_, rows, load, sliding)
+    drag = jnp.sum(rows * kick[:, :, None], axis=(0, 1))
+    after = begin - scale * push
+    slower = _at_most_elastic(after, drag)
+    after = after - slower * drag
+    # What others do that the support has to withstand.
+    own = set_.tangents * (slower * kick)[:, :, None]
+    given = jnp.sum(jnp.where(others, -load[:, None] * set_.normals, 0.0), axis=0) + jnp.sum(own, axis=(0, 1))
+    keeps, presses = matmul(t_held, given - y), -matmul(n_held[0], jnp.sum(load[:, None] * set_.normals, axis=0))
+    return after, presses, root(_above_rounding(matmul(keeps, keeps), y))
+
+
+def _kicks(set_: _Set, rows: Any, load: Any, sliding: Any) -> Any:
+    """What every surface takes of the slip, shape (K, 2): the shortest impulse that stops all of it, shared by what the
+    laws reverse, and multiplied by what they say. What friction caps is taken out, and the others stop the rest."""
+    reversal, restitution = set_.touched.reversal, set_.touched.restitution
+    weights = root(0.5 * (1.0 + reversal))[:, None]
+    closing = load / (1.0 + restitution)
+
+    def shared_by(part: Any, left: Any) -> Any:
+        weighted = (rows * (jnp.where(part, 1.0, 0.0)[:, None] * weights)[:, :, None]).reshape(-1, 6)
+        return weights * matmul(_pseudo_inverse(weighted).T, left).reshape(-1, 2)
+
+    def times_law(stops: Any) -> Any:
+        squared = _above_rounding(jnp.sum(stops * stops, axis=1), sliding) / set_.share
+        return (set_.slip_factors(closing, squared) / set_.share)[:, None]
+
+    stops = shared_by(jnp.ones_like(load, bool), sliding)
+    factor = times_law(stops)
+    if not set_.has_caps:
+        return factor * stops
+    whole = 1.0 + reversal[:, None]
+    capped = factor < whole
+    taken = jnp.where(capped, stops * factor / jnp.where(whole > 0, whole, 1.0), 0.0)
+    rest = shared_by(~capped[:, 0], sliding - jnp.sum(rows * taken[:, :, None], axis=(0, 1)))
+    return jnp.where(capped, factor * stops, times_law(rest) * rest)
+
+
+def _above_rounding(squares: Any, y: Any) -> Any:
+    """Squares of velocities that are parts of y, zero where they are rounding."""
+    eps = float(jnp.finfo(y.dtype).eps)
+    return jnp.where(squares > eps * eps * matmul(y, y), squares, 0.0)
+
+
+def _at_most_elastic(y: Any, change: Any) -> Any:
+    """The part of a change, at most 1, by which y may be lessened without growing in size."""
+    most, size = 2.0 * matmul(y, change), _above_rounding(matmul(change, change), y)
+    eps = float(jnp.finfo(y.dtype).eps)
+    grows = most < size * (1.0 - 256.0 * eps)
+    return jnp.where(grows, jnp.maximum(most, 0.0) / jnp.where(grows, size, 1.0), 1.0)
+
+
+def _pseudo_inverse(rows: Any) -> Any:
+    """The pseudo-inverse, shape (6, k), of few rows of one scale, row by row (Greville 1960)."""
+    tolerance = 1e3 * float(jnp.finfo(rows.dtype).eps)
+
+    def one(inverse: Any, each: tuple) -> tuple:
+        here, row = each
+        known = matmul(row, inverse)
+        rest = row - matmul(known, rows)
+        rest = rest - matmul(matmul(rest, inverse), rows)
+        size = matmul(rest, rest)
+        is_new = size > tolerance * tolerance
+        new = rest / jnp.where(is_new, size, 1.0)
+        old = matmul(inverse, known) / (1.0 + matmul(known, known))
+        column = jnp.where(is_new, new, old)
+        return inverse - column[:, None] * known[None] + column[:, None] * here[None], None
+
+    count = rows.shape[0]
+    return lax.scan(one, jnp.zeros((6, count), rows.dtype), (np.eye(count, dtype=rows.dtype), rows))[0]

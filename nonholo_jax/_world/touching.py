@@ -1,0 +1,170 @@
+"""What a ball touches at one instant, and what an impact on all of it does."""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from .._impact import Touched, reflected, takes_part
+from .._math import Number, Vector3, dot, frozen, is_constant, plus, scale, subtract
+from .stack import Member, Stack
+from .surface import AbstractSurface
+from .system import magnitude, rounding
+
+_MOST = 8  # surfaces of those touched that are looked at, if a scene has more
+_FEW = 16  # surfaces of which all pairs are looked at before there is a program
+_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def may_touch_two(surfaces: Sequence[AbstractSurface | Stack], radius: Number) -> bool:
+    """Whether a ball may touch two of the surfaces at one instant, as far as is known when it is traced."""
+    if any(isinstance(each, Stack) for each in surfaces) or len(surfaces) > _FEW:
+        return True
+    return any(not are_apart(a, b, radius) for a, b in itertools.combinations(surfaces, 2))  # pyright: ignore
+
+
+def are_apart(a: AbstractSurface, b: AbstractSurface, radius: Number) -> bool:
+    """Whether two surfaces are known to lie on two sides of a slab that is thicker than the ball."""
+    if not is_constant(radius):
+        return False
+    for n in (*a.directions(), *b.directions(), *_AXES):
+        if not all(is_constant(c) for c in n):
+            continue
+        for one, other in ((a, b), (b, a)):
+            ends = one.most(n), other.most(scale(-1.0, n))
+            if all(is_constant(end) for end in ends) and -(ends[0] + ends[1]) > 2.0 * radius:  # pyright: ignore
+                return True
+    return False
+
+
+class Support(NamedTuple):
+    """The surface that a ball stays on."""
+
+    index: Any  # -1 for a ball that flies
+    friction: Number | None  # infinite where the ball never slides or never rolls; `None` if that is so on all surfaces
+    rolls: Any
+
+
+class _Here(NamedTuple):
+    """A surface as a ball at one place sees it."""
+
+    normal: Any
+    gap: Any  # to first order
+    noise: Any  # of the gap
+    is_edge: Any  # the nearest part of it is an edge or a corner
+    ahead: Any  # how much it lies ahead of the ball: of two flush faces, the ball moves onto the one that does more
+
+
+def _every(scene: Any, function: Callable[[Member], Any]) -> Any:
+    """A function of every surface, with an axis in front."""
+    row = lambda x: jnp.asarray(x)[None]  # noqa: E731
+    parts = [jax.tree.map(row, function(each)) if isinstance(each, Member) else each[1].each(each[0], function)
+             for each in scene.contacts()]  # fmt: skip
+    return jax.tree.map(lambda *each: jnp.concatenate(each), *parts)
+
+
+def touches(scene: Any, member: Member, time: Any, position: Vector3) -> Any:
+    """Whether a ball touches a surface, to rounding."""
+    noise = rounding(scene, member, magnitude(position), time.dtype)
+    return abs(scene.level(member, time, position, None)) <= 16.0 * noise
+
+
+def touches_two(scene: Any, time: Any, position: Vector3) -> Any:
+    """Whether a ball touches more than one surface."""
+    return jnp.sum(_every(scene, lambda each: touches(scene, each, time, position)), dtype=jnp.int32) > 1
+
+
+def after_all(scene: Any, time: Any, struck: Any, state: Any, support: Support | None) -> tuple:
+    """An impact on everything that is touched, of a ball that hits the surface number `struck`: whether it is more than
+    an ordinary impact on that; velocity and spin afterwards; and whether the ball is still on its support then."""
+    nearby = _nearby(scene, time, struck, state, support)
+    touched, pick = nearby
+    v = jnp.stack([jnp.asarray(c, time.dtype) for c in state.velocity])
+    parts, stays = takes_part(frozen(touched), frozen(v))
+    only = jnp.any(parts & (pick(_numbers(scene)) == struck)) & (jnp.sum(parts, dtype=jnp.int32) == 1)
+    touched = touched._replace(takes_part=parts)
+
+    def factors(closing: Any, squared: Any) -> Any:
+        sizes = [_spread(x, pick, scene.n_contacts) for x in (closing, squared)]
+        alpha = scene.ball.inertia_ratio
+
+        def factor(each: Member) -> Any:
+            here = [x[each.number] for x in sizes]
+            return jnp.asarray(each.surface.law.slip_factor(alpha, *here), time.dtype)
+
+        return pick(_every(scene, factor))
+
+    laws = [each.first.law if isinstance(each, Stack) else each.law for each in scene.surfaces]
+    has_caps = any(law.sliding_friction() is not None or law.reversal() is None for law in laws)
+    friction, rolls = (None, 0.0) if support is None else (support.friction, support.rolls)
+    sizes = scene.ball.radius, scene.ball.inertia_ratio
+    after = reflected(*sizes, touched, factors, has_caps, friction, rolls, state.velocity, state.spin)
+    return ~only | stays, after, stays
+
+
+def _numbers(scene: Any) -> Any:
+    return jnp.arange(scene.n_contacts, dtype=jnp.int32)
+
+
+def _spread(x: Any, pick: Callable, count: int) -> Any:
+    """What belongs to the surfaces that were picked, for all surfaces."""
+    return jnp.zeros((count,), x.dtype).at[pick(jnp.arange(count, dtype=jnp.int32))].set(x)
+
+
+def _nearby(scene: Any, time: Any, struck: Any, state: Any, support: Support | None) -> tuple[Touched, Callable]:
+    """The surfaces that are touched, without those that say nothing of their own; and what picks from a value for every
+    surface those that are looked at."""
+    x, count = state.position, scene.n_contacts
+    here = _every(scene, lambda each: _seen(scene, each, time, state))
+    numbers = _numbers(scene)
+    held = jnp.zeros((count,), bool) if support is None else numbers == support.index
+    touched = (abs(here.gap) <= 16.0 * here.noise) | (numbers == struck) | held
+    pick: Callable = lambda values: values  # noqa: E731
+    if count > _MOST:
+        few = jnp.nonzero(touched, size=_MOST, fill_value=count - 1)[0]
+        pick = lambda values: values[few]  # noqa: E731
+        is_first = jnp.arange(_MOST, dtype=jnp.int32) < jnp.sum(touched, dtype=jnp.int32)
+        touched, held, here = is_first, pick(held) & is_first, jax.tree.map(pick, here)
+    spare = frozen(_are_spare(scene, time, x, here, touched, held, pick))
+    numbers = lambda value: jnp.asarray(0.0 if value is None else value, time.dtype)  # noqa: E731
+    law = lambda each: (numbers(each.surface.law.restitution), numbers(each.surface.law.reversal()))  # noqa: E731
+    restitution, reversal = (pick(each) for each in _every(scene, law))
+    return Touched(here.normal, touched & ~spare, held, restitution, reversal), pick
+
+
+def _seen(scene: Any, each: Member, time: Any, state: Any) -> _Here:
+    surface, x = each.surface, state.position
+    as_array = lambda value: jnp.asarray(value, time.dtype)  # noqa: E731
+    is_edge, ahead, face = jnp.asarray(False), as_array(-jnp.inf), surface.face(x, time)
+    if surface.has_edges and face is not None:
+        is_edge = ~jnp.asarray(face.below)
+        ahead = as_array(dot(state.velocity, subtract(face.center, x)))
+    normal = jnp.stack([as_array(c) for c in surface.direction(x, time)])
+    gap = as_array(scene.level(each, time, x, state))
+    noise = as_array(rounding(scene, each, magnitude(x), time.dtype))
+    return _Here(normal, gap, noise, is_edge, ahead)
+
+
+def _are_spare(scene: Any, time: Any, x: Any, here: _Here, touched: Any, held: Any, pick: Callable) -> Any:
+    """Which of the touched surfaces say nothing that another one does not: edges that lie on another surface, as two
+    flush faces have them where they meet, and faces with one normal."""
+    radius = scene.ball.radius
+    place = jnp.stack([jnp.asarray(c, time.dtype) for c in x])
+    points = place[None] - plus(radius, here.gap)[:, None] * here.normal
+    far = lambda each: jax.vmap(lambda p: jnp.asarray(each.surface.distance(tuple(p), time), time.dtype))(points)  # noqa: E731
+    lies_on = pick(abs(_every(scene, far))) <= 2.0 * here.noise[:, None]  # of the point of the second on the first
+    apart = jnp.max(abs(here.normal[:, None] - here.normal[None]), axis=-1)
+    alike = apart <= 2.0 * here.noise[:, None] / radius
+    alike = alike & ~here.is_edge[:, None] & ~here.is_edge[None]
+    covers = touched[:, None] & touched[None] & ~jnp.eye(touched.size, dtype=bool)
+    covers = covers & ((lies_on & here.is_edge[None]) | alike)
+    # Of two that cover each other one stays, the same one in whatever order they come.
+    order = jnp.arange(touched.size, dtype=jnp.int32)
+    keys = (held.astype(jnp.int32), 1 - here.is_edge.astype(jnp.int32), here.ahead, -here.gap, -order)
+    better, equal = jnp.zeros_like(covers), jnp.ones_like(covers)
+    for key in keys:
+        better = better | (equal & (key[:, None] > key[None]))
+        equal = equal & (key[:, None] == key[None])
+    return jnp.any(covers & (better | ~covers.T), axis=0)
