@@ -30,7 +30,6 @@ class Touched(NamedTuple):
     takes_part: Any  # whether it is touched, or, for an impact, whether it takes part
     is_support: Any
     restitution: Any
-    reversal: Any  # e_t, 0 where the law has no such number
 
 
 def loaded(touched: Touched, velocity: Any) -> tuple[Any, Any]:
@@ -42,27 +41,28 @@ def loaded(touched: Touched, velocity: Any) -> tuple[Any, Any]:
     ways = [way for size in (1, 2, 3) for way in itertools.combinations(range(count), size)]
     picked = np.array([[i in way for i in range(count)] for way in ways])
     slots = np.array([[[i == j for i in range(count)] for j in (*way, *[count] * (3 - len(way)))] for way in ways])
-    closing = -matmul(normals, velocity)
+    closing, speed = -matmul(normals, velocity), jnp.sqrt(jnp.sum(velocity * velocity))
 
     def one(picked: Any, slots: Any) -> tuple:
-        """The loads of one way, the velocity after them, and by how much they are wrong."""
+        """The loads of one way, the velocity after them, and by which part they are wrong."""
         rows = matmul(slots, normals)  # (3, 3), zeros where fewer are loaded
         fill = jnp.diag(1.0 - jnp.sum(slots, axis=1))
         a, b, c = matmul(rows, rows.T) + fill
         adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
         size = matmul(a, adjugate[0])
-        load = matmul(matmul(slots, closing), adjugate) / jnp.where(size > 64.0 * eps, size, 1.0)
-        each = matmul(load, slots)
-        after = velocity + matmul(each, normals)
-        into = jnp.where(present, -matmul(normals, after), 0.0)
         possible = (size > 64.0 * eps) & jnp.all(present | ~picked)
-        return each, after, jnp.where(possible, jnp.max(jnp.maximum(into, -each)), jnp.inf)
+        load, after = jnp.zeros(3, velocity.dtype), velocity
+        for _ in range(2):  # once more for what rounding has left
+            load = load - matmul(matmul(rows, after), adjugate) / jnp.where(possible, size, 1.0)
+            after = velocity + matmul(load, rows)
+        each, into = matmul(load, slots), jnp.where(present, -matmul(normals, after), 0.0)
+        wrong = jnp.max(jnp.maximum(into, -each)) / (speed + jnp.sum(abs(load)) + float(jnp.finfo(speed.dtype).tiny))
+        return each, after, jnp.where(possible, wrong, jnp.inf)
 
     each, after, violation = jax.vmap(one)(picked, slots.astype(velocity.dtype))
     best = jnp.argmin(violation)
-    small = 64.0 * eps * jnp.sqrt(jnp.sum(velocity * velocity))
-    shares = violation <= jnp.maximum(small, violation[best])
-    counts = jnp.any(shares[:, None] & (each > small), axis=0)
+    shares = violation <= jnp.maximum(64.0 * eps, violation[best])
+    counts = jnp.any(shares[:, None] & (each > 64.0 * eps * speed), axis=0)
     # What closes by rounding alone is loaded by nothing but that; an impact is of it all the same.
     counts = jnp.where(jnp.any(counts), counts, jnp.any(shares[:, None] & (each > 0), axis=0))
     closes = jnp.any(present & (closing > 0))
@@ -83,7 +83,6 @@ def reflected(
     inertia_ratio: Number,
     touched: Touched,
     slip_factors: Callable,
-    has_caps: bool,
     friction: Number | None,
     grips: Any,
     velocity: Vector3,
@@ -92,12 +91,12 @@ def reflected(
     """Velocity and spin after an impact on all surfaces that take part.
 
     **Arguments:** `slip_factors(closing, slip_squared)`: the factors s of all laws, as a single impact has them;
-    `has_caps`: whether some of these are less than a gripping contact would have; `friction`: of the support, `None` if
+    `friction`: of the support, `None` if
     it is infinite or zero, as `grips` says.
     """
     y, stretch = _whitened(radius, inertia_ratio, velocity, spin)
     share = jnp.asarray(inertia_ratio / (1.0 + inertia_ratio), y.dtype)
-    set_ = _Set(*_rows(touched.normals, stretch[3]), touched, slip_factors, has_caps, share, inertia_ratio)
+    set_ = _Set(*_rows(touched.normals, stretch[3]), touched, slip_factors, share)
     grips = jnp.asarray(grips).astype(y.dtype)
     if friction is None:
         after = _within(set_, y, grips)[0]
@@ -124,9 +123,7 @@ class _Set(NamedTuple):
     tangents: Any  # (K, 2, 6), of unit length
     touched: Touched
     slip_factors: Callable
-    has_caps: bool
     share: Any
-    inertia_ratio: Any
 
 
 def _whitened(radius: Number, inertia_ratio: Number, velocity: Vector3, spin: Vector3) -> tuple[Any, Any]:
@@ -184,29 +181,33 @@ def _within(set_: _Set, y: Any, grip: Any) -> tuple[Any, Any, Any]:
 
 
 def _kicks(set_: _Set, rows: Any, load: Any, sliding: Any) -> Any:
-    """What every surface takes of the slip, shape (K, 2): the shortest impulse that stops all of it, shared by what the
-    laws reverse, and multiplied by what they say. What friction caps is taken out, and the others stop the rest."""
-    reversal, restitution = set_.touched.reversal, set_.touched.restitution
-    weights = root(0.5 * (1.0 + reversal))[:, None]
-    closing = load / (1.0 + restitution)
+    """What every surface takes of the slip, shape (K, 2). Where all laws have one factor w, it is w times the shortest
+    impulse that stops all of the slip. Where not, as far as to the least w all take part in that, from there to the
+    next one those that reach so far, and so on: continuous in all numbers, and a smooth surface, w = 0, is not there.
+    """
+    closing = jnp.maximum(load, 0.0) / (1.0 + set_.touched.restitution)
 
-    def shared_by(part: Any, left: Any) -> Any:
-        weighted = (rows * (jnp.where(part, 1.0, 0.0)[:, None] * weights)[:, :, None]).reshape(-1, 6)
-        return weights * matmul(_pseudo_inverse(weighted).T, left).reshape(-1, 2)
-
-    def times_law(stops: Any) -> Any:
+    def factors(stops: Any) -> Any:
         squared = _above_rounding(jnp.sum(stops * stops, axis=1), sliding) / set_.share
-        return (set_.slip_factors(closing, squared) / set_.share)[:, None]
+        return set_.slip_factors(closing, squared) / set_.share
 
-    stops = shared_by(jnp.ones_like(load, bool), sliding)
-    factor = times_law(stops)
-    if not set_.has_caps:
-        return factor * stops
-    whole = 1.0 + reversal[:, None]
-    capped = factor < whole
-    taken = jnp.where(capped, stops * factor / jnp.where(whole > 0, whole, 1.0), 0.0)
-    rest = shared_by(~capped[:, 0], sliding - jnp.sum(rows * taken[:, :, None], axis=(0, 1)))
-    return jnp.where(capped, factor * stops, times_law(rest) * rest)
+    own = factors(matmul(rows, sliding))
+    own = jnp.where(set_.touched.takes_part & ~set_.touched.is_support, own, 0.0)
+    order = jnp.argsort(-lax.stop_gradient(own))
+    levels = own[order]
+
+    def shared_by(first: Any) -> Any:
+        """By so many of the ablest."""
+        able = jnp.any((order[None] == np.arange(own.size)[:, None]) & first[None], axis=1) & (own > 0)
+        part = jnp.where(able[:, None, None], rows, 0.0).reshape(-1, sliding.size)
+        return matmul(_pseudo_inverse(part).T, sliding).reshape(-1, 2)
+
+    steps = levels - jnp.concatenate([levels[1:], jnp.zeros_like(levels[:1])])
+    kicks = jnp.sum(steps[:, None, None] * jax.vmap(shared_by)(np.tri(own.size, dtype=bool)), axis=0)
+    gripping = factors(jnp.zeros_like(kicks))[:, None]
+    grips = gripping > 0
+    stops = kicks / jnp.where(grips, gripping, 1.0)
+    return jnp.where(grips, factors(stops)[:, None] * stops, 0.0)
 
 
 def _above_rounding(squares: Any, y: Any) -> Any:
@@ -224,7 +225,7 @@ def _at_most_elastic(y: Any, change: Any) -> Any:
 
 
 def _pseudo_inverse(rows: Any) -> Any:
-    """The pseudo-inverse, shape (6, k), of few rows of one scale, row by row (Greville 1960)."""
+    """The pseudo-inverse, shape (n, k), of few rows of one scale, shape (k, n), row by row (Greville 1960)."""
     tolerance = 1e3 * float(jnp.finfo(rows.dtype).eps)
 
     def one(inverse: Any, each: tuple) -> tuple:
@@ -239,5 +240,5 @@ def _pseudo_inverse(rows: Any) -> Any:
         column = jnp.where(is_new, new, old)
         return inverse - column[:, None] * known[None] + column[:, None] * here[None], None
 
-    count = rows.shape[0]
-    return lax.scan(one, jnp.zeros((6, count), rows.dtype), (np.eye(count, dtype=rows.dtype), rows))[0]
+    begin = jnp.zeros(rows.shape[::-1], rows.dtype)
+    return lax.scan(one, begin, (np.eye(rows.shape[0], dtype=rows.dtype), rows))[0]

@@ -96,11 +96,9 @@ def after_all(scene: Any, time: Any, struck: Any, state: Any, support: Support |
 
         return pick(_every(scene, factor))
 
-    laws = [each.first.law if isinstance(each, Stack) else each.law for each in scene.surfaces]
-    has_caps = any(law.sliding_friction() is not None or law.reversal() is None for law in laws)
     friction, rolls = (None, 0.0) if support is None else (support.friction, support.rolls)
     sizes = scene.ball.radius, scene.ball.inertia_ratio
-    after = reflected(*sizes, touched, factors, has_caps, friction, rolls, state.velocity, state.spin)
+    after = reflected(*sizes, touched, factors, friction, rolls, state.velocity, state.spin)
     return ~only | stays, after, stays
 
 
@@ -128,10 +126,9 @@ def _nearby(scene: Any, time: Any, struck: Any, state: Any, support: Support | N
         is_first = jnp.arange(_MOST, dtype=jnp.int32) < jnp.sum(touched, dtype=jnp.int32)
         touched, held, here = is_first, pick(held) & is_first, jax.tree.map(pick, here)
     spare = frozen(_are_spare(scene, time, x, here, touched, held, pick))
-    numbers = lambda value: jnp.asarray(0.0 if value is None else value, time.dtype)  # noqa: E731
-    law = lambda each: (numbers(each.surface.law.restitution), numbers(each.surface.law.reversal()))  # noqa: E731
-    restitution, reversal = (pick(each) for each in _every(scene, law))
-    return Touched(here.normal, touched & ~spare, held, restitution, reversal), pick
+    law = lambda each: jnp.asarray(each.surface.law.restitution, time.dtype)  # noqa: E731
+    restitution = pick(_every(scene, law))
+    return Touched(here.normal, touched & ~spare, held, restitution), pick
 
 
 def _seen(scene: Any, each: Member, time: Any, state: Any) -> _Here:
