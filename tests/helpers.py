@@ -266,3 +266,12 @@ def result_of(trajectory) -> str:
 def results_of(trajectory) -> list[str]:
     """The names of the results of a batch."""
     return [result_name(lane(trajectory.result, i)) for i in range(len(trajectory.t1))]
+
+
+def turned_axes(quaternion):
+    """`axes_of`, for JAX arrays."""
+    w, v = quaternion[0], quaternion[1:]
+    size = jnp.sqrt(jnp.sum(quaternion * quaternion))
+    w, v = w / size, v / size
+    rows = [e + 2 * w * jnp.cross(v, e) + 2 * jnp.cross(v, jnp.cross(v, e)) for e in jnp.eye(3, dtype=v.dtype)]
+    return jnp.stack(rows)

@@ -14,22 +14,22 @@ PACKAGE = pathlib.Path(nonholo_jax.__file__).parent
 # From the ground up, and so in each room.
 ROOMS = {
     "_math": ["types", "vector", "shared", "hops", "polynomial", "gap", "rotation", "tiles", "tangents"],
-    "_impact": ["projector", "law", "corner", "train", "rolling"],
+    "_impact": ["projector", "law", "together", "train", "rolling"],
     "_world": [
         "ball",
         "surface",
         "box",
         "round",
         "air",
-        "stack",
         "system",
+        "touching",
         "checks",
         "scene",
         "settling",
         "grounded",
         "lagrangian",
     ],
-    "_motion": ["crossing", "motion", "integrated", "loop", "replay", "accuracy", "trajectory", "simulate"],
+    "_motion": ["crossing", "motion", "integrated", "loop", "hopping", "replay", "accuracy", "trajectory", "simulate"],
     "_questions": [
         "diagnostics",
         "names",

@@ -16,6 +16,7 @@ _LABELS = {
     "rolling": "{}, rolling",
     "left": "over the edge of {}",
     "gripped": "{}, slips no more",
+    "passed": "on to {}",
 }
 
 
@@ -37,7 +38,7 @@ def motion_of(scene: Any, trajectory: Any) -> dict[str, Any]:
     """The part of a report that every verb has."""
     log = jax.tree.map(np.asarray, trajectory.impacts)
     impacts = []
-    for i in range(min(int(trajectory.n_impacts), len(log.time))):
+    for i in range(min(int(trajectory.n_rows), len(log.time))):
         before, after = (jax.tree.map(lambda x, i=i: x[i], each) for each in (log.before, log.after))
         impacts.append(
             {

@@ -197,10 +197,10 @@ def _nearest(trajectory: Trajectory, point: Any, after: int) -> Any:
     begins, phases = join(trajectory.t0[None], log.until), join(-jnp.ones(1, jnp.int32), log.support)
     starts = jax.tree.map(join, first, log.after)
     arc = after + jnp.arange(rows + 1 - after, dtype=jnp.int32)
-    is_last = arc == trajectory.n_impacts
+    is_last = arc == trajectory.n_rows
     ends = jnp.where(is_last, trajectory.t1, join(log.time, trajectory.t1[None]))
     arrivals = jax.tree.map(lambda x, y: jnp.where(along(is_last, y), y, join(x, y)), log.before, last)
-    there = is_last | ((arc < trajectory.n_impacts) & (arc < rows))
+    there = is_last | ((arc < trajectory.n_rows) & (arc < rows))
     tame = lambda x, y: jnp.where(along(there, x), x, y)  # noqa: E731
     starts, arrivals = (jax.tree.map(tame, x, first) for x in (starts, arrivals))
     begins, ends = jnp.where(there, begins, 0.0), jnp.where(there, ends, 0.0)

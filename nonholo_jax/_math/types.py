@@ -61,7 +61,7 @@ class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
-NO_IMPACTS = ("left", "gripped")
+NO_IMPACTS = ("left", "gripped", "passed")
 NAMES_OF_RESULTS = tuple(RESULTS._name_to_item)
 
 
@@ -111,3 +111,4 @@ class KINDS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
         "The slip of a ball that slid has died out, without an impact: from here it rolls, or, where it is too steep "
         "for that, slides downhill."
     )
+    passed = "The ball goes on from one face to another one that is flush with it, without an impact."

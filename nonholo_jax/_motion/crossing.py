@@ -117,7 +117,7 @@ def _return(system: AbstractSystem, contact: Any, arc: Arc) -> Return | None:
     if any(len(p) > 3 for p in arc.configuration):
         return None
     parts = [tuple(p[k] if len(p) > k else 0.0 for p in arc.configuration) for k in range(3)]
-    return system.returns(contact, arc.time, *parts)
+    return system.returns(contact, arc.time, *parts, arc.start)
 
 
 def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, window: Any, touching: Any) -> _Step:

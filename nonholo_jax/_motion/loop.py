@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._math import ENDS, FULL, KINDS, PAUSES, RESULTS, Hopper, frozen, norm, on_cpu, shared, total, where
+from .._math import KINDS, RESULTS, frozen, norm, on_cpu, shared, total, where
 from .._world import AbstractSystem, Meeting
 from .crossing import crossing_time, search
 from .motion import AbstractMotion
@@ -81,6 +81,7 @@ class Outcome(NamedTuple):
     n_arcs: Any
     result: Any
     log: Log
+    n_passed: Any = None
 
 
 class Carry(NamedTuple):
@@ -97,7 +98,8 @@ class Carry(NamedTuple):
     control: Any
     # what was done
     since: Any  # seconds since the last impact
-    n_impacts: Any
+    n_impacts: Any  # and hand-overs: the rows of a log that is long enough
+    n_passed: Any  # hand-overs from face to face alone; `None` where there are none
     n_arcs: Any
     n_turns: Any
     n_at_once: Any
@@ -229,6 +231,7 @@ def start(system, motion, state, t0, t1, log_rows: int, path_rows: int) -> Carry
         control=control,
         since=jnp.zeros_like(t0),
         n_impacts=zero,
+        n_passed=zero if system.may_pass else None,
         n_arcs=zero,
         n_turns=zero,
         n_at_once=zero,
@@ -264,48 +267,48 @@ def turn(
     found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
     kept, finished = _shared_flags((kept, found.finished))
     ended = active & kept & finished
-    crossed = ended & (found.contact >= 0)
+    crossed, contact = ended & (found.contact >= 0), system.choice(found.contact)
     through = ended & ~crossed
-    contact = system.choice(found.contact)
     s = where(through, arc.length, found.s)
     if differentiable and system.n_contacts > 0:
         s = where(crossed, crossing_time(s, found.contact, system, arc), s)
     (s,) = shared([s])
-    elapsed = s * arc.unit
-    reached = through & last
+    elapsed, reached = s * arc.unit, through & last
     time, ahead = later(c.time, c.ahead, elapsed)
     time = where(reached, t1, time)
-    arrived = as_arrays(system.advanced(time, ready, arc.position(s), arc.velocity(s), elapsed), t1.dtype)
-    arrived = computed_once(arrived)
+    arrived = system.advanced(time, ready, arc.position(s), arc.velocity(s), elapsed)
+    arrived = computed_once(as_arrays(arrived, t1.dtype))
 
-    since, speed = c.since + elapsed, norm(frozen(arc.tangent(s)))
-    at_once = since * speed <= _tiny(arc, s) * arc.unit
-    same = found.contact == c.touching  # bounces on one surface die out, they are no corner
-    n_at_once = where(at_once & (c.n_impacts > 0) & ~same, c.n_at_once + 1, 0)
-    full, stuck = c.n_impacts >= max_impacts, n_at_once > _MOST_IMPACTS_AT_ONCE
+    since = c.since + elapsed
+    n_at_once = _at_once(c, arc, s, since, found.contact)
+    full, stuck = c.n_impacts >= allowed(c, max_impacts), n_at_once > _MOST_IMPACTS_AT_ONCE
     met, name = Meeting(KINDS.unused, RESULTS.reached_t1, arrived, 0.0, False), found.contact
     if system.n_contacts > 0:
         name = system.named(contact, arrived)
         met = system.meets(contact, time, arrived, t1 - time, found.rests, found.ends)
-    after = as_arrays(met.after, t1.dtype)
+    after, n_passed = as_arrays(met.after, t1.dtype), c.n_passed
+    if n_passed is not None:  # a hand-over is no impact, and is named by what the ball comes onto
+        passed = met.kind == KINDS.passed
+        full, stuck, name = full & ~passed, stuck & ~passed, where(passed, system.phase(after), name)
+        n_passed = n_passed + (crossed & passed).astype(jnp.int32)
     failed = met.fault != RESULTS.reached_t1
-    stopped = crossed & (failed | full | stuck)
-    stopped, crossed = _shared_flags((stopped, crossed))
+    stopped, crossed = _shared_flags((crossed & (failed | full | stuck), crossed))
     struck = crossed & ~stopped
     until, settled = time + met.pause, struck & met.is_at_rest
-    row, kind = Row(time, until, since, arrived, after), _code(met.kind)
+    row, kind = Row(time, until, since, arrived, after), jnp.asarray(met.kind._value, dtype=jnp.int32)
     log = _written(c.log, c.n_impacts, struck, pack_row(row), jnp.stack([name, kind, system.phase(after)]))
     sizes = where(last, jnp.inf, length), s, c.ahead
     path = _followed(c, ended, sizes, found.contact, kind, Flags(c.jumped, struck, reached))
 
-    broken = ended & ~jnp.isfinite(total([time, *jax.tree.leaves(jax.tree.map(jnp.sum, arrived))]))
-    (broken,) = _shared_flags((broken,))
+    finite = jnp.isfinite(total([time, *jax.tree.leaves(jax.tree.map(jnp.sum, arrived))]))
+    (broken,) = _shared_flags((ended & ~finite,))
     n_arcs = c.n_arcs + ended.astype(jnp.int32)
-    exhausted = (c.n_turns + 1 >= motion.max_turns(max_impacts)) | (n_arcs >= motion.max_pieces(max_impacts))
+    most = system.most_rows(max_impacts)
+    exhausted = (c.n_turns + 1 >= motion.max_turns(most)) | (n_arcs >= motion.max_pieces(most))
     exhausted = active & exhausted & ~(reached | stopped | settled | broken)
-    cases = [(crossed & full, RESULTS.max_impacts), (crossed & stuck, RESULTS.corner), (crossed & failed, met.fault),
-             (settled, RESULTS.at_rest), (broken, RESULTS.invalid_state), (exhausted, RESULTS.step_limit)]  # fmt: skip
-    code = functools.reduce(lambda code, case: where(case[0], case[1]._value, code), cases, c.result._value)
+    faults = [(full, RESULTS.max_impacts), (stuck, RESULTS.corner), (failed, met.fault)]
+    ends = [(settled, RESULTS.at_rest), (broken, RESULTS.invalid_state), (exhausted, RESULTS.step_limit)]
+    code = _why(c, [*[(crossed & holds, why) for holds, why in faults], *ends])
     goes_on = active & kept & ~ended
     return c._replace(
         time=where(struck, until, where(ended, time, c.time)),
@@ -319,6 +322,7 @@ def turn(
         control=keep(active & (ended | ~kept), control, c.control),
         since=where(struck, 0.0, where(ended, since, c.since)),
         n_impacts=c.n_impacts + struck.astype(jnp.int32),
+        n_passed=n_passed,
         n_arcs=n_arcs,
         n_turns=c.n_turns + active.astype(jnp.int32),
         n_at_once=where(struck, n_at_once, c.n_at_once),
@@ -329,6 +333,11 @@ def turn(
     )
 
 
+def allowed(c: Carry, max_impacts: int) -> Any:
+    """How many rows there may be: hand-overs are no impacts."""
+    return max_impacts if c.n_passed is None else max_impacts + c.n_passed
+
+
 def later(time: Any, ahead: Any, elapsed: Any) -> tuple[Any, Any]:
     """The time after so many seconds, and by how much rounding has put that ahead: Kahan's sum. Bounces of one height
     would otherwise all round it the same way, in float32 at 1e6 s by hundredths of a second each."""
@@ -337,8 +346,15 @@ def later(time: Any, ahead: Any, elapsed: Any) -> tuple[Any, Any]:
     return total, frozen((total - time) - step)
 
 
-def _code(kind: Any) -> Any:
-    return jnp.asarray(kind._value, dtype=jnp.int32)
+def _at_once(c: Carry, arc: Any, s: Any, since: Any, contact: Any) -> Any:
+    """How many impacts have followed each other at one instant. Bounces on one surface die out, they are no corner."""
+    at_once = since * norm(frozen(arc.tangent(s))) <= _tiny(arc, s) * arc.unit
+    return where(at_once & (c.n_impacts > 0) & (contact != c.touching), c.n_at_once + 1, 0)
+
+
+def _why(c: Carry, cases: list) -> Any:
+    """The code of how a motion ended, by the last case that holds."""
+    return functools.reduce(lambda code, case: where(case[0], case[1]._value, code), cases, c.result._value)
 
 
 def _result_of(code: Any) -> RESULTS:
@@ -356,91 +372,6 @@ def _tiny(arc: Any, s: Any) -> Any:
     return 64.0 * eps * frozen(norm(arc.position(s)))
 
 
-class _Hopping(NamedTuple):
-    """A carry without what only a search needs."""
-
-    time: Any
-    ahead: Any
-    state: Any
-    mark: Any  # the contact just left, or -1; once it has stopped, when and why, as `_stopped` has it
-    turn: Any
-    path: Any  # the choices so far, or none
-
-
-def _stopped(turn: Any, touching: Any, why: Any, bits: int) -> Any:
-    """A mark below -1 from the number of impacts, the contact last touched and the reason, 0 to 2."""
-    return ~((((turn << bits) | (touching + 1)) << 2 | why) + 1)
-
-
-def _unmarked(mark: Any, bits: int) -> tuple:
-    known = ~mark - 1
-    return known >> (bits + 2), ((known >> 2) & ((1 << bits) - 1)) - 1, known & 3
-
-
-def hopped(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows: int = 0) -> tuple[Carry, Any]:
-    """The motion as far as it is a row of ordinary impacts, known in closed form, and the choices of the hops, in so
-    many rows."""
-    end = _hops(carry, system, t1, max_impacts, rows)
-    return _landed(carry, end, system, t1), end.path
-
-
-def _hops(carry: Carry, system: AbstractSystem, t1: Any, max_impacts: int, rows: int = 0) -> _Hopping:
-    """All lanes that hop are at the same impact, so that the number of turns counts their impacts."""
-    bits, hopper = system.n_contacts.bit_length(), system.hopper(carry.state)
-    assert hopper is not None
-
-    def hop(c: _Hopping) -> _Hopping:
-        going, full = c.mark >= -1, c.turn >= max_impacts - carry.n_impacts
-        done = hopper.first(c.mark, going, full, t1 - c.time + c.ahead, c.state)
-        why = where(done.choice == ENDS, 0, where(done.choice <= FULL, 1, 2))
-        stop = _stopped(c.turn, jnp.maximum(c.mark, -1), why, bits)
-        mark = where(done.choice >= 0, done.choice.astype(jnp.int32), where(going, stop, c.mark))
-        time, ahead = later(c.time, c.ahead, done.duration)
-        path = c.path.at[c.turn].set(done.choice.astype(c.path.dtype)) if rows else c.path
-        return _Hopping(time, ahead, done.state, mark, c.turn + 1, path)
-
-    zero = jnp.asarray(0, dtype=jnp.int32)
-    mark = where(_can_start(carry, system), carry.touching, _stopped(zero, -1, 2, bits))
-    path = jnp.full((rows,), int(PAUSES), jnp.int16)
-    begin = _Hopping(carry.time, carry.ahead, carry.state, mark, zero, path)
-    return lax.while_loop(lambda c: eqxi.unvmap_any(c.mark >= -1), hop, begin)
-
-
-def _can_start(carry: Carry, system: AbstractSystem) -> Any:
-    return ~carry.done & (carry.s == 0) & (system.phase(carry.state) < 0)
-
-
-def _landed(carry: Carry, end: _Hopping, system: AbstractSystem, t1: Any) -> Carry:
-    """The carry after hops."""
-    free = _can_start(carry, system)
-    n_impacts, touching, why = _unmarked(end.mark, system.n_contacts.bit_length())
-    reached, full, moved = free & (why == 0), free & (why == 1), n_impacts > 0
-    return carry._replace(
-        time=where(reached, t1, end.time),
-        ahead=end.ahead,
-        state=end.state,
-        window=where(moved, jnp.inf, carry.window),
-        touching=where(free, touching, carry.touching),
-        jumped=carry.jumped | moved,
-        since=where(moved, 0.0, carry.since),
-        n_impacts=carry.n_impacts + n_impacts,
-        n_arcs=carry.n_arcs + n_impacts + (reached | full).astype(jnp.int32),
-        n_at_once=where(moved, 0, carry.n_at_once),
-        done=carry.done | reached | full,
-        result=RESULTS.where(full, RESULTS.max_impacts, carry.result),
-    )
-
-
-def hopper_of(system: AbstractSystem, motion: AbstractMotion, state: Any, max_impacts: int) -> Hopper | None:
-    """How the system hops, if it does."""
-    few = (max_impacts + 2) << (system.n_contacts.bit_length() + 2) < 2**31
-    return system.hopper(state) if motion.is_closed_form and few else None
-
-
-def _turned(c: Carry, system, motion, t1, max_impacts: int) -> Carry:
-    return hopped(turn(c, system, motion, t1, max_impacts), system, t1, max_impacts)[0]
-
-
 def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = None) -> Outcome:
     """Run the loop. `kind` says how the loop itself may be differentiated: `None` not at all, "lax" forward,
     "checkpointed" in reverse."""
@@ -450,37 +381,11 @@ def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind
     if kind in (None, "lax"):
         end = lax.while_loop(going, next_turn, carry)
     else:
-        end = eqxi.while_loop(going, next_turn, carry, kind=kind, max_steps=motion.max_turns(max_impacts))
-    return _outcome(end)
+        end = eqxi.while_loop(
+            going, next_turn, carry, kind=kind, max_steps=motion.max_turns(system.most_rows(max_impacts))
+        )
+    return outcome_of(end)
 
 
-class Paused(NamedTuple):
-    """How far hops have come, beside the outcome."""
-
-    unfinished: Any
-    ahead: Any
-    mark: Any
-
-
-def begin_by_hops(system, motion, state, t0, t1, *, max_impacts: int) -> tuple[Outcome, Paused]:
-    """`find`, as far as it goes by hops. Neither this nor the rest is for derivatives."""
-    carry = start(system, motion, state, t0, t1, 0, 0)
-    end = _hops(carry, system, t1, max_impacts)
-    c = _landed(carry, end, system, t1)
-    return _outcome(c), Paused(~c.done, end.ahead, end.mark)
-
-
-def finish(outcome: Outcome, paused: Paused, system, motion, t1, *, max_impacts: int) -> Outcome:
-    """The rest, by turns, and, where hops are a short program, by both. The carry, which is long, is made again."""
-    hopper = system.hopper(outcome.state)
-    next_of = _turned if hopper is not None and hopper.again is not None else turn
-    carry = start(system, motion, outcome.state, outcome.time, t1, 0, 0)
-    nothing = jnp.zeros((0,), jnp.int16)
-    end = _Hopping(outcome.time, paused.ahead, outcome.state, paused.mark, outcome.n_impacts, nothing)
-    going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
-    next_turn = lambda c: next_of(c, system, motion, t1, max_impacts)  # noqa: E731
-    return _outcome(lax.while_loop(going, next_turn, _landed(carry, end, system, t1)))
-
-
-def _outcome(c: Carry) -> Outcome:
-    return Outcome(c.time, c.state, c.n_impacts, c.n_arcs, c.result, c.log)
+def outcome_of(c: Carry) -> Outcome:
+    return Outcome(c.time, c.state, c.n_impacts, c.n_arcs, c.result, c.log, c.n_passed)

@@ -29,6 +29,7 @@ from .._math import (
 )
 from .._world import AbstractSystem
 from .crossing import crossing_time
+from .hopping import begin_by_hops, finish, hopped, hopper_of
 from .loop import (
     Begun,
     Carry,
@@ -38,13 +39,9 @@ from .loop import (
     Row,
     arcs_of,
     as_arrays,
-    begin_by_hops,
     computed_once,
     empty_path,
     find,
-    finish,
-    hopped,
-    hopper_of,
     keep,
     kind_of,
     later,
@@ -125,10 +122,9 @@ def _hop_again(begun: Begun, choices: Any, hop: Callable, t1: Any) -> Begun:
     return begun._replace(time=time, state=state)
 
 
-def _iteration(max_impacts: int, log_rows: int, motion: AbstractMotion, values: Any, in_batch: bool) -> Iteration:
+def _iteration(max_impacts: int, log_rows: int, pieces: int, values: Any, in_batch: bool) -> Iteration:
     """The motion with derivatives: a part of the path is found without them, and its arcs are repeated with them."""
     of_motion = lambda system, motion: motion.in_batch(system) if in_batch else motion  # noqa: E731
-    pieces = motion.max_pieces(max_impacts)
     most = -(-pieces // _ROWS)
     rows = -(-pieces // most)
 
@@ -243,7 +239,8 @@ def _find_or_replay_jvp(primals, tangents, *, max_impacts: int, log_rows: int):
     out = _find_or_replay(*primals, max_impacts=max_impacts, log_rows=log_rows)
     still = frozen(out)
     like = (still.time, still.state, still.log.values)
-    alone, many = (_iteration(max_impacts, log_rows, primals[1], still.log.values, each) for each in (False, True))
+    pieces = primals[1].max_pieces(primals[0].most_rows(max_impacts))
+    alone, many = (_iteration(max_impacts, log_rows, pieces, still.log.values, each) for each in (False, True))
     time, state, values = tangent_of(alone, many, primals, tangents, still.n_arcs, like, primals[1].tile)
     values = jnp.where(jnp.isnan(still.log.values), 0.0, values)
     nothing = jax.tree.map(lambda _: None, out)

@@ -63,7 +63,8 @@ def simulate(
     - `t1`, `t0`: times in s, t1 >= t0. Traced, so that a new value is no recompilation.
     - `max_impacts`: >= 0. A motion that arrives at one impact more stops there, before it, with
         `RESULTS.max_impacts`.
-    - `log_size`: rows of the log; `None` for `max_impacts`, 0 for none.
+    - `log_size`: rows of the log; `None` for `max_impacts` and, where faces may be flush, as many hand-overs from one
+        to the other; 0 for none.
     - `motion`: `Exact()` or `Integrated(...)`; `None` picks `Exact()` where the scene allows it, else `Integrated()`:
         with air, a gap of unknown curvature, or friction on a slope, across which a ball slides along a curve.
     - `accuracy`: instead of `motion`, the error of the final position, in m, that is wanted: a Python number > 0. Picks
@@ -92,6 +93,7 @@ def simulate(
     wanted = None if accuracy is None else (accuracy, state, t0, t1)
     motion, log_rows = checked(scene, motion, max_impacts, log_size, slides=sum_trains, wanted=wanted)
     system = _continued(scene, motion, sum_trains)
+    log_rows = system.most_rows(log_rows) if log_size is None else log_rows
     state = scene.received(state, batch=False, t0=t0)
     dtype = jax.tree.leaves(state)[0].dtype
     t0, t1 = (_array(t, dtype) for t in (t0, t1))
@@ -143,6 +145,7 @@ def simulate_batch(
     wanted, slides = None if accuracy is None else (accuracy, states, t0, t1), sum_trains and one_scene
     motion, log_rows = checked(scene, motion, max_impacts, log_size, slides=slides, wanted=wanted)
     system = _continued(scene, motion, sum_trains)
+    log_rows = system.most_rows(log_rows) if log_size is None else log_rows
     states = scene.received(states, batch=True, t0=t0)
     dtype = jax.tree.leaves(states)[0].dtype
     t0, t1 = (_array(t, dtype) for t in (t0, t1))

@@ -48,7 +48,8 @@ class Trajectory(eqx.Module):
 
     - `final`: state at `t1`; after the impact if one happens there.
     - `t1`: time reached in s. Earlier than asked for if the motion ended otherwise: see `result`.
-    - `impacts`: an `ImpactLog`; `n_impacts`, how many rows there were (the log may hold fewer). A train is one.
+    - `impacts`: an `ImpactLog`; `n_rows`, how many rows there were (the log may hold fewer). A train is one.
+    - `n_impacts`: rows that count for `max_impacts`: all but hand-overs between flush faces, `n_passed`.
     - `n_arcs`: pieces of smooth motion computed: flights with `Exact`, accepted steps with `Integrated`.
     - `result`: one of `RESULTS`.
     - `t0`, `initial`, `system`, `motion`: what the motion began with.
@@ -58,6 +59,7 @@ class Trajectory(eqx.Module):
     t1: Float[Array, "*batch"]
     impacts: ImpactLog
     n_impacts: Int[Array, "*batch"]
+    n_passed: Int[Array, "*batch"]
     n_arcs: Int[Array, "*batch"]
     result: RESULTS
     t0: Float[Array, "*batch"]
@@ -65,6 +67,11 @@ class Trajectory(eqx.Module):
     system: Any  # an AbstractSystem
     motion: Any  # an AbstractMotion
     mapped: tuple[bool, ...] | None = eqx.field(static=True, default=None)
+
+    @property
+    def n_rows(self) -> Any:
+        """How many rows a log that is long enough has. Shape as `n_impacts`."""
+        return self.n_impacts + self.n_passed
 
     def at(self, t: Any) -> Any:
         """The state at time `t` in s (scalar or array), exact between impacts: the motion is taken up at the impact
@@ -99,15 +106,15 @@ def _at_one(trajectory: Trajectory, t: Any) -> Any:
     end = trajectory.t1
     start, begin, phase = trajectory.initial, trajectory.t0, jnp.asarray(-1, dtype=jnp.int32)
     if rows > 0:
-        n = jnp.minimum(trajectory.n_impacts, rows)
+        n = jnp.minimum(trajectory.n_rows, rows)
         past = jnp.sum((log.until <= t) & (jnp.arange(rows, dtype=n.dtype) < n), dtype=n.dtype)
         row = jnp.maximum(past - 1, 0)
         start = jax.tree.map(lambda a, b: jnp.where(past > 0, a[row], b), log.after, start)
         begin = jnp.where(past > 0, log.until[row], begin)
         phase = jnp.where(past > 0, log.support[row], phase)
-        end = jnp.where(trajectory.n_impacts > rows, log.until[rows - 1], end)
+        end = jnp.where(trajectory.n_rows > rows, log.until[rows - 1], end)
     else:
-        end = jnp.where(trajectory.n_impacts > 0, trajectory.t0, end)
+        end = jnp.where(trajectory.n_rows > 0, trajectory.t0, end)
     inside = (t >= trajectory.t0) & (t <= end)
     free = system.without_contacts()
     until = jnp.where(inside, t, begin)
@@ -141,12 +148,14 @@ def _in_train(trajectory: Trajectory, past: Any, n: Any, t: Any) -> tuple[Any, A
 
 def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any, outcome: Outcome) -> Trajectory:
     """The user's form of an outcome."""
-    log = _log(system, t0, outcome)
+    log, n_rows = _log(system, t0, outcome), outcome.n_impacts
+    n_passed = jnp.zeros_like(n_rows) if outcome.n_passed is None else outcome.n_passed
     return Trajectory(
         final=system.packed(outcome.state),
         t1=outcome.time,
         impacts=log,
-        n_impacts=outcome.n_impacts,
+        n_impacts=n_rows if outcome.n_passed is None else n_rows - n_passed,
+        n_passed=n_passed,
         n_arcs=outcome.n_arcs,
         result=outcome.result,
         t0=t0,

@@ -387,7 +387,7 @@ def _caption(scene: Scene, view: View, strikes: Strikes, enlarged: float, fastes
 
 def _title(scene: Scene, trajectory: Any, strikes: Strikes, end: float, title: str | None) -> str:
     if title is None:
-        words = {"left": "off {}", "train": "{} (dying out)", "gripped": "{} (gripped)"}
+        words = {"left": "off {}", "train": "{} (dying out)", "gripped": "{} (gripped)", "passed": "on to {}"}
         names = [words.get(k, "{}").format(scene.names[i]) for i, k in zip(strikes.surface, strikes.kind, strict=True)]
         groups = [(name, len(list(same))) for name, same in groupby(names)]
         words = [f"{name} \N{MULTIPLICATION SIGN}{n}" if n > 1 else name for name, n in groups]

@@ -41,7 +41,7 @@ def end_of(trajectory: Any, until: float | None) -> float:
     rows, ends = trajectory.impacts.time.shape[0], [float(trajectory.t1)]
     if until is not None:
         ends.append(max(float(until), float(trajectory.t0)))
-    if int(trajectory.n_impacts) > rows:
+    if int(trajectory.n_rows) > rows:
         ends.append(float(trajectory.impacts.time[-1]) if rows else float(trajectory.t0))
     return min(ends)
 

@@ -194,8 +194,10 @@ def _up_to_row(trajectory: Trajectory, row: int) -> Trajectory:
     kept = jax.tree.map(lambda x: cut(x, np.nan if jnp.issubdtype(x.dtype, np.floating) else 0), log)
     kept = dataclasses.replace(kept, surface=cut(log.surface, -1), support=cut(log.support, -1))
     final, t1 = jax.tree.map(lambda x: jax.device_put(np.asarray(x)[row]), (log.after, log.until))
-    n_impacts = jax.device_put(np.asarray(row + 1, log.surface.dtype))
-    parts = {"final": final, "t1": t1, "impacts": kept, "n_impacts": n_impacts}
+    passed = np.sum(np.asarray(kept.kind == KINDS.passed)[: row + 1])
+    counts = {"n_impacts": row + 1 - passed, "n_passed": passed}
+    counts = {name: jax.device_put(np.asarray(count, log.surface.dtype)) for name, count in counts.items()}
+    parts = {"final": final, "t1": t1, "impacts": kept, **counts}
     return dataclasses.replace(trajectory, result=RESULTS.reached_t1, **parts)
 
 

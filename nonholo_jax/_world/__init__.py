@@ -8,6 +8,6 @@ from .lagrangian import Barrier as Barrier, LagrangianSystem as LagrangianSystem
 from .round import Cylinder as Cylinder, Sphere as Sphere
 from .scene import Scene as Scene
 from .settling import slides_across as slides_across
-from .stack import Member as Member, Stack as Stack
 from .surface import AbstractSurface as AbstractSurface, Implicit as Implicit, Plane as Plane, Return as Return
 from .system import AbstractSystem as AbstractSystem, Meeting as Meeting, magnitude as magnitude, rounding as rounding
+from .touching import Member as Member, Stack as Stack

@@ -38,7 +38,7 @@ from .._math import (
     unit,
     where,
 )
-from .surface import AbstractSurface, Face, Return, check, nonzero, positive
+from .surface import AbstractSurface, Along, Face, Return, check, nonzero, positive
 
 
 def _excess(y: Vector3, half: Vector3) -> Vector3:
@@ -139,6 +139,34 @@ class AbstractBlock(AbstractSurface):
         center, half, axes = self._frame()
         return _box_bend(window, axes, center, half, radius)
 
+    def along(self, n, x, v, slack):
+        center, half, axes = self._frame()
+        y, w, d = _in_frame(x, center, axes), along(v, axes), along(n, axes)
+        like = [abs(d[i]) if i in self.faces else -1.0 for i in range(3)]
+        pick = _largest(like)
+        backwards = pick(d) < 0
+        normal = tuple(
+            where(backwards, times(-1.0, c), c) for c in (pick(column) for column in zip(*axes, strict=True))
+        )
+        height = plus(where(backwards, times(-1.0, pick(y)), pick(y)), times(-1.0, pick(half)))
+        inside = [(abs(c) < h - slack) | ((abs(c) <= h + slack) & (where(c < 0, times(-1.0, u), u) <= 0))
+                  for c, u, h in zip(y, w, half, strict=True)]  # fmt: skip
+        holds = pick([inside[i - 2] & inside[i - 1] for i in range(3)])
+        return Along(normal, height, holds, dot(v, subtract(center, x)))  # pyright: ignore
+
+    def rim(self, n):
+        center, half, axes = self._frame()
+        d = along(n, axes)
+        pick = _largest([abs(d[i]) if i in self.faces else -1.0 for i in range(3)])
+        others = [[*things[i:], *things[:i]] for things in (axes, half) for i in (1, 2)]
+        sides = [(tuple(pick(column) for column in zip(*others[i], strict=True)), pick(others[i + 2])) for i in (0, 1)]
+        return center, sides
+
+    def planes(self):
+        center, half, axes = self._frame()
+        signed = [(scale(s, axes[i]), half[i]) for i in self.faces for s in (1.0, -1.0)]
+        return [(n, plus(dot(n, center), h)) for n, h in signed]
+
     def directions(self):
         axes = self._frame()[2]
         return (*axes, *[scale(-1.0, axis) for axis in axes])
@@ -156,7 +184,10 @@ class AbstractBlock(AbstractSurface):
         pick = _farthest(y, half, self.faces)
         backwards = pick(y) < 0
         rise, pull = (where(backwards, times(-1.0, c), c) for c in (pick(w), times(-1.0, pick(b))))
-        comes = (pull > 0) & (rise > 0) & _is_over(y, half, pick)
+        # Not of a ball that has just rolled over an edge, whose place is known to rounding only.
+        eps = float(jnp.finfo(jnp.result_type(*[c for c in y if not is_constant(c)])).eps)
+        inner = tuple(plus(h, times(-64.0 * eps, plus(h, self.extent()))) for h in half)
+        comes = (pull > 0) & (rise > 0) & _is_over(y, inner, pick)
         duration = where(comes, rise / where(comes, pull, 1.0), 0.0)
         landing = tuple(plus(c, times(duration, plus(u, times(duration, d)))) for c, u, d in zip(y, w, b, strict=True))
         return Return(duration, comes & _is_over(landing, half, pick), rise, pull)  # pyright: ignore
@@ -166,9 +197,13 @@ def _farthest(y: Vector3, half: Vector3, choices: Sequence[int]) -> Callable[[Se
     """Picks from three things that of the axis along which a point is farthest beyond a box, among `choices`."""
     if len(choices) == 1:
         return lambda options: options[choices[0]]
-    excess = _excess(y, half)
-    first = (excess[0] >= excess[1]) & (excess[0] >= excess[2])
-    second = excess[1] >= excess[2]
+    return _largest(_excess(y, half))
+
+
+def _largest(sizes: Sequence) -> Callable[[Sequence], Any]:
+    """Picks from three things that of the largest of three numbers."""
+    first = (sizes[0] >= sizes[1]) & (sizes[0] >= sizes[2])
+    second = sizes[1] >= sizes[2]
     return lambda options: where(first, options[0], where(second, options[1], options[2]))
 
 

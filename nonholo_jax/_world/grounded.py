@@ -2,8 +2,9 @@
 and leaves faces over their edges. Rolling is a phase of the same motion, on the same loop and in the same log."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, ClassVar
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -20,6 +21,8 @@ from .._math import (
     add,
     cross,
     dot,
+    maximum,
+    minimum,
     rolled,
     scale,
     subtract,
@@ -30,13 +33,19 @@ from .._math import (
 from .round import round_bend, round_level
 from .scene import Scene
 from .settling import Floors, Ground, Settling, Travel, phase_of
-from .stack import Member
 from .system import AbstractSystem, Meeting, bounces
+from .touching import Member, may_be_flush
 
 
 def _if_any(condition: Any, wanted: Callable, plain: Callable) -> Any:
     """`wanted()` if a condition holds in any lane of a batch: otherwise `plain()`, which must be equal then."""
     return lax.cond(eqxi.unvmap_any(condition), wanted, plain)
+
+
+class _Entry(NamedTuple):
+    flush: Any
+    inside: Any  # the ball is above the face, or it has no edges
+    rim: Sequence  # its edges: across, middle, half size
 
 
 class Grounded(AbstractSystem):
@@ -48,10 +57,19 @@ class Grounded(AbstractSystem):
     tolerance: float = eqx.field(static=True)
     parabolic: bool = eqx.field(static=True)
     hits: bool = eqx.field(static=True)
+    may_pass: bool = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
     is_long: ClassVar[bool] = False
 
-    def __init__(self, scene: Scene, tolerance: float = 0.0, parabolic: bool = False, hits: bool = True):
+    def __init__(
+        self,
+        scene: Scene,
+        tolerance: float = 0.0,
+        parabolic: bool = False,
+        hits: bool = True,
+        may_pass: bool | None = None,
+    ):
         self.scene, self.tolerance, self.parabolic, self.hits = scene, tolerance, parabolic, hits
+        self.may_pass = may_be_flush(scene.surfaces, scene.ball.radius) if may_pass is None else may_pass
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -59,7 +77,7 @@ class Grounded(AbstractSystem):
 
     @property
     def _settling(self) -> Settling:
-        return Settling(self.scene, self.tolerance, self.parabolic, Floors(self.scene))
+        return Settling(self.scene, self.tolerance, self.parabolic, Floors(self.scene), self.may_pass)
 
     @property
     def _floors(self) -> Floors:
@@ -171,7 +189,14 @@ class Grounded(AbstractSystem):
         x = q[:3]
         if isinstance(contact, Member):
             on = phase_of(state) == contact.number
-            return where(on, 1.0, self.scene.level(contact, time, x, state.flight))
+            away = self.scene.level(contact, time, x, state.flight)
+            if self.may_pass:
+                found = self._flush(contact, time, state)
+                entry = [round_level((dot(axis, subtract(x, middle)),), half, False)
+                         for axis, middle, half in found.rim]  # fmt: skip
+                away = where(found.flush, functools.reduce(maximum, entry or [1.0]), away)
+                on = on | found.inside
+            return where(on, 1.0, away)
         if contact == self._end_of_slip:
             heading = self._below(time, state).heading
             return where(dot(heading, heading) > 0, dot(heading, q[3:]), 1.0)
@@ -179,13 +204,23 @@ class Grounded(AbstractSystem):
         y = dot(across, subtract(x, middle))
         return where(present, round_level((y,), half, True), 1.0)
 
+    def _flush(self, contact: Member, time: Any, state: Travel) -> "_Entry":
+        """How a ball on a support sees a face that is flush with it: it comes onto it over its edges."""
+        below = self._below(time, state)
+        assert below.flush is not None
+        flush, rim = below.flush.flush[contact.number], contact.surface.rim(below.face.normal)
+        inside = flush & (below.flush.holds[contact.number] | (rim is None))
+        return _Entry(flush, inside, [] if rim is None else [(axis, rim[0], half) for axis, half in rim[1]])
+
     def is_parabolic(self, contact):
         return self.scene.is_parabolic(contact) if isinstance(contact, Member) else contact == self._end_of_slip
 
-    def returns(self, contact, time, q, v, half_a):
+    def returns(self, contact, time, q, v, half_a, state):
         if not isinstance(contact, Member):
             return None
-        return self.scene.returns(contact, time, q[:3], v[:3], half_a[:3])
+        back = self.scene.returns(contact, time, q[:3], v[:3], half_a[:3], state.flight)
+        # A ball that rolls neither leaves its support nor comes back to it, whatever rounding says.
+        return None if back is None else back._replace(comes=back.comes & (phase_of(state) != contact.number))
 
     def reach(self, contact, q):
         return self.scene.reach(contact, q[:3]) if isinstance(contact, Member) else self.scene.ball.radius
@@ -194,6 +229,13 @@ class Grounded(AbstractSystem):
         place = window._replace(coefficients=window.coefficients[:3])
         if isinstance(contact, Member):
             bend, skip = self.scene.bend(contact, time, place, state.flight), phase_of(state) == contact.number
+            if self.may_pass:
+                found = self._flush(contact, time, state)
+                bends = [round_bend(place, (axis,), middle, half, False) for axis, middle, half in found.rim]
+                low, high = ([getattr(each, end) for each in bends] or [0.0] for end in ("low", "high"))
+                rim = type(bend)(functools.reduce(minimum, low), functools.reduce(maximum, high))
+                bend = type(bend)(*[where(found.flush, a, b) for a, b in zip(rim, bend, strict=True)])
+                skip = skip | found.inside
         elif contact == self._end_of_slip:
             heading = self._below(time, state).heading
             bend = window._replace(coefficients=window.coefficients[3:]).along(heading, rolling.NONE).bend

@@ -314,7 +314,7 @@ class LagrangianSystem(AbstractSystem):
     def is_parabolic(self, contact):
         return False
 
-    def returns(self, contact, time, q, v, half_a):
+    def returns(self, contact, time, q, v, half_a, state):
         return None
 
     def reach(self, contact, q):

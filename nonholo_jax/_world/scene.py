@@ -39,10 +39,9 @@ from .._math import (
 from .air import Air
 from .ball import Ball, BallState, check_ball_state
 from .box import AbstractBlock, along
-from .stack import Member, Stack, stacked
 from .surface import AbstractSurface, Plane
 from .system import AbstractSystem, bounces, magnitude, rounding
-from .touching import Support, after_all, may_touch_two, touches_two
+from .touching import Member, Stack, Support, after_all, may_touch_two, stacked, touches_two
 
 
 class Flight(NamedTuple):
@@ -271,7 +270,7 @@ class Scene(AbstractSystem):
     def is_parabolic(self, contact):
         return self._surface(contact).is_parabolic
 
-    def returns(self, contact, time, q, v, half_a):
+    def returns(self, contact, time, q, v, half_a, state):
         surface = self._surface(contact)
         elastic = is_constant(surface.law.restitution) and surface.law.restitution == 1  # such bounces stay high
         return None if elastic else surface.returns(q, v, half_a, time)

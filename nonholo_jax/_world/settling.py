@@ -32,10 +32,9 @@ from .._math import (
     where_vector,
 )
 from .scene import Flight, Scene
-from .stack import Member, Stack
 from .surface import AbstractSurface, Face
 from .system import Meeting, magnitude, rounding
-from .touching import Support
+from .touching import Member, Neighbours, Stack, Support, neighbours, numbers_of as _numbers
 
 
 def _can_settle(surface: AbstractSurface) -> bool:
@@ -123,6 +122,7 @@ class Ground(NamedTuple):
     slip: Vector3  # zero of a ball that rolls, and where there is no friction to slide against
     heading: Vector3  # the direction in which it slides against friction, or zero
     straight: Any  # whether it keeps that direction until its slip ends
+    flush: Neighbours | None = None  # the faces that are flush with it, if there can be any
 
 
 class Travel(NamedTuple):
@@ -164,6 +164,7 @@ class Settling(NamedTuple):
     tolerance: float
     parabolic: bool
     floors: Floors
+    joins: bool  # whether faces may be flush
 
     @property
     def end_of_slip(self) -> int:
@@ -179,8 +180,9 @@ class Settling(NamedTuple):
         share = where(rolls, ratio(1.0, 1.0 + ball.inertia_ratio), 1.0)
         pivot = where_vector(rolls, scale(dot(n, flight.spin), n), flight.spin)
         free = Freedom(where(on, 1.0, 0.0), share, pivot, where(rolls, ratio(1.0, ball.radius), 0.0))
+        flush = self._flush(time, state, n) if self.joins else None
         if not floors.have_friction:
-            return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True)
+            return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True, flush)
         friction = floors.friction(support)
         slides = rolls & jnp.isfinite(friction)
         slip = rolling.own_slip(ball.radius, n, flight.velocity, flight.spin)
@@ -190,7 +192,23 @@ class Settling(NamedTuple):
         along = rolling.along_surface(n, a)
         heading = where_vector(slides, rolling.heading(slip, along, most), rolling.NONE)
         straight = self.parabolic or rolling.stays_straight(heading, slip, along, most, self.tolerance)
-        return Ground(face, edged, rolls, friction, free, slip, heading, straight)
+        return Ground(face, edged, rolls, friction, free, slip, heading, straight, flush)
+
+    def _flush(self, time: Any, state: Travel, n: Vector3) -> Neighbours:
+        """The faces that are flush with the one that the ball is on, that itself left out."""
+        found = neighbours(self.scene, time, n, self.scene.ball.radius, state.flight)
+        other = (_numbers(self.scene) != phase_of(state)) & (state.support >= 0)
+        return found._replace(flush=found.flush & other)
+
+    def _onto(self, touch: Touch) -> Any:
+        """The surface onto which a ball passes that comes to an edge of its support, or onto a flush face; or -1."""
+        found = self._flush(touch.time, touch.state, touch.face.normal)
+        index, least = touch.contact.index, float(jnp.finfo(touch.time.dtype).min)
+        reached = found.flush & (found.holds | (_numbers(self.scene) == index))
+        best = jnp.argmax(jnp.where(reached, jnp.maximum(found.ahead, least), -jnp.inf)).astype(jnp.int32)
+        over = (index >= self.scene.n_contacts) & (index != self.end_of_slip)
+        comes = over | jnp.any(found.flush & (_numbers(self.scene) == index))
+        return where(comes & jnp.any(reached), best, np.int32(-1))
 
     def pull(self, time: Any, flight: Flight) -> Vector3:
         """Gravity, and what air gives now."""
@@ -208,6 +226,10 @@ class Settling(NamedTuple):
     ) -> Touch:
         """`stays` says whether a ball that was on a face before an impact is there afterwards."""
         floors, on = self.floors, (state.support >= 0) & (stays | (contact.index >= self.scene.n_contacts))
+        if self.joins:  # on a face that is flush with its support it is no less on that
+            face, _ = floors.face(self.scene.choice(phase_of(state)), state.flight.position, time)
+            flush = self._flush(time, state, face.normal).flush
+            on = on | jnp.any(flush & (_numbers(self.scene) == contact.index))
         floor = self.scene.choice(where(on, phase_of(state), contact.index))
         face, edged = floors.face(floor, state.flight.position, time)
         first = train.start(struck.velocity, struck.spin, face.normal, pull, self.scene.ball.radius)
@@ -234,8 +256,14 @@ class Settling(NamedTuple):
                 margin = half - abs(dot(across, subtract(x, face.center)))
                 room = minimum(room, where(touch.edged, margin, jnp.inf))
 
+        flush = None
+        if self.joins:
+            flush = neighbours(self.scene, touch.time, face.normal, radius, touch.struck).flush
+
         def clear(other: Member) -> Number:
-            return where(touch.floor.index == other.number, jnp.inf, other.surface.clearance(x, touch.time, radius))
+            own: Any = touch.floor.index == other.number
+            own = own if flush is None else own | flush[other.number]
+            return where(own, jnp.inf, other.surface.clearance(x, touch.time, radius))
 
         for each in self.scene.contacts():
             room = minimum(room, clear(each) if isinstance(each, Member) else jnp.min(each[1].each(each[0], clear)))
@@ -279,13 +307,17 @@ class Settling(NamedTuple):
         bounce_or_end = KINDS.where(dies_out & clear, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
         over = KINDS.where(grips, KINDS.gripped, KINDS.left)
         kind = KINDS.where(on, KINDS.where(is_exit, over, KINDS.rolling), bounce_or_end)
+        passes = on & (self._onto(touch) >= 0) if self.joins else False
+        kind = KINDS.where(passes, KINDS.passed, kind) if self.joins else kind
 
         end = train.summed(*self.train_of(touch, kind))
         after, pause, wedged, is_at_rest = self.settled(touch, kind, end)
         stuck = ~is_exit & where(on, rests & ~wedged, ends & ~is_floor)
+        stuck = stuck & ~passes if self.joins else stuck
         fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
         fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
-        fault = RESULTS.where(on & is_exit & ~grips & self._tips(touch), RESULTS.pivoting, fault)
+        tips = on & is_exit & ~grips & self._tips(touch)
+        fault = RESULTS.where(tips & ~passes if self.joins else tips, RESULTS.pivoting, fault)
         if self.floors.have_friction and self.parabolic:
             below, pull = self.ground(touch.time, after), self.pull(touch.time, after.flight)
             straight = rolling.is_straight(below.heading, rolling.along_surface(below.face.normal, pull), norm(pull))
@@ -327,8 +359,23 @@ class Settling(NamedTuple):
         )
         surface = touch.contact.index.astype(jnp.asarray(touch.state.support).dtype)
         support = where(settles, surface, where(stays, touch.state.support, -1.0))
+        if self.joins:
+            passed, onto = kind == KINDS.passed, self._onto(touch)
+            support = where(passed, onto.astype(support.dtype), support)
+            after = self._passed(passed, onto, touch, after)
         at_rest = (settles | stays) & self._is_still(touch, after, held)
         return Travel(after, support), where(settles, end.time, 0.0), wedged, at_rest
+
+    def _passed(self, passed: Any, onto: Any, touch: Touch, after: Flight) -> Flight:
+        """The state of a ball that has passed onto a flush face: as it was, but where it cannot slip it rolls."""
+        flight, ball, floor = touch.state.flight, self.scene.ball, self.scene.choice(onto)
+        state = flight.velocity, flight.spin
+        rolling_ = rolling.gripped(ball.radius, ball.inertia_ratio, touch.face.normal, *state)
+        firm = self.floors.rolls(floor) & ~jnp.isfinite(self.floors.friction(floor))
+        kept = [where_vector(passed, where_vector(firm, a, b), c)
+                for a, b, c in zip(rolling_, state, (after.velocity, after.spin), strict=True)]  # fmt: skip
+        return after._replace(position=where_vector(passed, flight.position, after.position), velocity=kept[0],
+                              spin=kept[1])  # fmt: skip
 
     def _is_still(self, touch: Touch, after: Flight, held: Any) -> Any:
         """Whether nothing moves any more, nor will."""

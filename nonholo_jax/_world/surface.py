@@ -43,6 +43,15 @@ class Face(NamedTuple):
     below: Any  # whether the ball's centre is over it, not over an edge
 
 
+class Along(NamedTuple):
+    """The flat face of a surface that faces most like a direction, as a ball at one place sees it."""
+
+    normal: Vector3
+    height: Number  # of the ball's centre above its plane
+    holds: Any  # whether the ball is above it, or comes above it at once
+    ahead: Number  # how fast the ball comes towards its middle, -inf of a face without edges
+
+
 class Return(NamedTuple):
     """A parabola that begins on a flat face and comes back to it. Until then it is on the outer side of the face's
     plane, so that it cannot meet the surface before."""
@@ -108,6 +117,22 @@ class AbstractSurface(eqx.Module):
     def clearance(self, x: Vector3, t: Number, radius: Number) -> Number:
         """How far at least the centre of a ball at `x` can go in any direction before it touches, in m."""
         return plus(self.distance(x, t), times(-1.0, radius))
+
+    def along(self, n: Vector3, x: Vector3, v: Vector3, slack: Number) -> Along | None:
+        """The face that faces most like n, for a ball at x with the velocity v, where places are known to `slack`;
+        `None` for a surface without faces."""
+        del n, x, v, slack
+        return None
+
+    def rim(self, n: Vector3) -> tuple[Vector3, Sequence[tuple[Vector3, Number]]] | None:
+        """The middle of the face that faces most like n, and both pairs of its edges: across, and half the distance.
+        `None` for a face without edges."""
+        del n
+        return None
+
+    def planes(self) -> Sequence[tuple[Vector3, Number]]:
+        """Normal n of every face, and n . x on it."""
+        return ()
 
     def directions(self) -> Sequence[Vector3]:
         """Directions along which this surface may be apart from others."""
@@ -194,6 +219,13 @@ class Plane(AbstractSurface):
 
     def bend(self, window, t, radius):
         return window.along(unit(components(self.facing)), (0.0, 0.0, 0.0)).bend
+
+    def along(self, n, x, v, slack):
+        return Along(self.direction(x, 0.0), self.distance(x, 0.0), True, -jnp.inf)
+
+    def planes(self):
+        n = unit(components(self.facing))
+        return ((n, dot(n, components(self.point))),)
 
     def directions(self):
         return (unit(components(self.facing)),)

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,6 +29,12 @@ class AbstractSystem(eqx.Module):
 
     n_contacts: eqx.AbstractVar[int]  # a contact is its number, or a `Member`
     is_long: eqx.AbstractClassVar[bool]  # `derivative` is a long program: a loop should hold it only once
+
+    may_pass: ClassVar[bool] = False  # whether it may be handed over from one contact to another, without an impact
+
+    def most_rows(self, max_impacts: int) -> int:
+        """How many rows a log may need for so many impacts."""
+        return 2 * max_impacts + 8 if self.may_pass else max_impacts
 
     def engine(self, dtype: Any) -> "AbstractSystem":
         """The same system as the event loop sees it, where all numbers have that dtype."""
@@ -104,9 +110,9 @@ class AbstractSystem(eqx.Module):
         """Whether the level along every parabola is one itself: `bend` is then exact over the whole arc."""
 
     @abstractmethod
-    def returns(self, contact: Any, time: Scalar, q: tuple, v: tuple, half_a: tuple) -> Return | None:
-        """When a parabola that begins on a flat face of a surface comes back to it, if low bounces on it are to be
-        exact, else `None`."""
+    def returns(self, contact: Any, time: Scalar, q: tuple, v: tuple, half_a: tuple, state: Any) -> Return | None:
+        """When a parabola that begins at `state` on a flat face of a surface comes back to it, if low bounces on it are
+        to be exact, else `None`."""
 
     @abstractmethod
     def reach(self, contact: Any, q: tuple) -> Number | None:

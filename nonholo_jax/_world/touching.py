@@ -1,21 +1,80 @@
-"""What a ball touches at one instant, and what an impact on all of it does."""
+"""Surfaces side by side: many of one class as one, what a ball touches of them at one instant, what an impact on all of
+it does, and what is flush."""
 
 import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from .._impact import Touched, reflected, takes_part
-from .._math import Number, Vector3, dot, frozen, is_constant, plus, scale, subtract
-from .stack import Member, Stack
+from .._math import Number, Vector3, dot, frozen, is_constant, plus, scale, subtract, times
 from .surface import AbstractSurface
 from .system import magnitude, rounding
 
 _MOST = 8  # surfaces of those touched that are looked at, if a scene has more
 _FEW = 16  # surfaces of which all pairs are looked at before there is a program
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+class Member(NamedTuple):
+    """A surface of a scene, and its number there, which may be traced."""
+
+    number: Any
+    surface: AbstractSurface
+
+
+class Stack(eqx.Module):
+    """Surfaces that follow each other in a scene and differ in nothing but numbers. A number that is one constant of
+    all of them stays that; the others have an axis in front."""
+
+    surface: AbstractSurface
+    count: int = eqx.field(static=True)
+
+    def at(self, index: Any) -> AbstractSurface:
+        """The surface of a traced index, counted from 0; the nearest one for an index that there is none of."""
+        index = jnp.clip(index, 0, self.count - 1)
+        return jax.tree.map(lambda x: x if is_constant(x) else x[index], self.surface)
+
+    @property
+    def first(self) -> AbstractSurface:
+        """One of them, for what they have in common."""
+        return jax.tree.map(lambda x: x if is_constant(x) else x[0], self.surface)
+
+    def each(self, start: int, function: Callable[[Member], Any]) -> Any:
+        """A function of every surface, with an axis in front; the first of them is number `start`."""
+        arrays, constants = eqx.partition(self.surface, eqx.is_array)
+        numbers = start + np.arange(self.count, dtype=np.int32)
+        return jax.vmap(lambda x, i: function(Member(i, eqx.combine(x, constants))))(arrays, numbers)
+
+
+def stacked(surfaces: Sequence[AbstractSurface], dtype: Any) -> tuple:
+    """The surfaces in their order, long rows of one class as `Stack`s."""
+    found: list = []
+    for _, row in itertools.groupby(surfaces, _structure):
+        each = list(row)
+        found += each if len(each) <= each[0].few else [Stack(_joined(each, dtype), len(each))]
+    return tuple(found)
+
+
+def _structure(surface: AbstractSurface) -> tuple:
+    """What surfaces of one stack have in common. An elastic law is structure: it spares the end of bounces."""
+    restitution = surface.law.restitution
+    shapes = tuple(() if is_constant(leaf) else jnp.shape(leaf) for leaf in jax.tree.leaves(surface))
+    return jax.tree.structure(surface), shapes, is_constant(restitution) and restitution == 1
+
+
+def _joined(surfaces: Sequence[AbstractSurface], dtype: Any) -> AbstractSurface:
+    def join(*leaves: Any) -> Any:
+        if not all(is_constant(leaf) for leaf in leaves):
+            return jnp.stack([jnp.asarray(leaf, dtype) for leaf in leaves])
+        same = all(leaf == leaves[0] for leaf in leaves)
+        return leaves[0] if same else jnp.asarray(np.array(leaves), dtype)
+
+    return jax.tree.map(join, *surfaces)
 
 
 def may_touch_two(surfaces: Sequence[AbstractSurface | Stack], radius: Number) -> bool:
@@ -36,6 +95,24 @@ def are_apart(a: AbstractSurface, b: AbstractSurface, radius: Number) -> bool:
             ends = one.most(n), other.most(scale(-1.0, n))
             if all(is_constant(end) for end in ends) and -(ends[0] + ends[1]) > 2.0 * radius:  # pyright: ignore
                 return True
+    return False
+
+
+def may_be_flush(surfaces: Sequence[AbstractSurface], radius: Number) -> bool:
+    """Whether two surfaces may have faces in one plane, as far as is known when it is traced."""
+    flat = [each for each in surfaces if type(each).along is not AbstractSurface.along]
+    return any(_share_a_plane(a, b) and not are_apart(a, b, radius) for a, b in itertools.combinations(flat, 2))
+
+
+def _share_a_plane(a: AbstractSurface, b: AbstractSurface) -> bool:
+    pairs = itertools.product(a.planes(), b.planes())
+    for (n, one), (m, other) in pairs:
+        differences = (*subtract(n, m), plus(one, times(-1.0, other)))
+        sizes = (a.extent(), b.extent())
+        if not all(is_constant(x) for x in (*differences, *sizes)):
+            return True
+        if max(abs(x) for x in differences[:3]) < 1e-3 and abs(differences[3]) <= 1e-3 * (sizes[0] + sizes[1]):
+            return True
     return False
 
 
@@ -76,6 +153,30 @@ def touches_two(scene: Any, time: Any, position: Vector3) -> Any:
     return jnp.sum(_every(scene, lambda each: touches(scene, each, time, position)), dtype=jnp.int32) > 1
 
 
+class Neighbours(NamedTuple):
+    """What is flush with a face, for every surface, with an axis in front."""
+
+    flush: Any  # whether it has a face in the same plane
+    holds: Any  # whether the ball is above that face, or comes above it at once
+    ahead: Any  # of several, the ball moves onto the one that is most of this
+
+
+def neighbours(scene: Any, time: Any, normal: Vector3, height: Any, state: Any) -> Neighbours:
+    """The faces in one plane with that of a `normal`, above which a ball is at a `height`."""
+    x, radius = state.position, scene.ball.radius
+
+    def of(each: Member) -> Neighbours:
+        noise = rounding(scene, each, magnitude(x), time.dtype)
+        face = each.surface.along(normal, x, state.velocity, 16.0 * noise)
+        if face is None:
+            return Neighbours(jnp.asarray(False), jnp.asarray(False), jnp.asarray(-jnp.inf, time.dtype))
+        turned = jnp.max(jnp.stack([jnp.asarray(abs(c), time.dtype) for c in subtract(face.normal, normal)]))
+        flush = (turned <= 2.0 * noise / radius) & (abs(face.height - height) <= 16.0 * noise)
+        return Neighbours(flush, jnp.asarray(face.holds), jnp.asarray(face.ahead, time.dtype))
+
+    return frozen(_every(scene, of))
+
+
 def after_all(scene: Any, time: Any, struck: Any, state: Any, support: Support | None) -> tuple:
     """An impact on everything that is touched, of a ball that hits the surface number `struck`: whether it is more than
     an ordinary impact on that; velocity and spin afterwards; and whether the ball is still on its support then."""
@@ -83,7 +184,7 @@ def after_all(scene: Any, time: Any, struck: Any, state: Any, support: Support |
     touched, pick = nearby
     v = jnp.stack([jnp.asarray(c, time.dtype) for c in state.velocity])
     parts, stays = takes_part(frozen(touched), frozen(v))
-    only = jnp.any(parts & (pick(_numbers(scene)) == struck)) & (jnp.sum(parts, dtype=jnp.int32) == 1)
+    only = jnp.any(parts & (pick(numbers_of(scene)) == struck)) & (jnp.sum(parts, dtype=jnp.int32) == 1)
     touched = touched._replace(takes_part=parts)
 
     def factors(closing: Any, squared: Any) -> Any:
@@ -102,7 +203,8 @@ def after_all(scene: Any, time: Any, struck: Any, state: Any, support: Support |
     return ~only | stays, after, stays
 
 
-def _numbers(scene: Any) -> Any:
+def numbers_of(scene: Any) -> Any:
+    """The number of every surface."""
     return jnp.arange(scene.n_contacts, dtype=jnp.int32)
 
 
@@ -116,7 +218,7 @@ def _nearby(scene: Any, time: Any, struck: Any, state: Any, support: Support | N
     surface those that are looked at."""
     x, count = state.position, scene.n_contacts
     here = _every(scene, lambda each: _seen(scene, each, time, state))
-    numbers = _numbers(scene)
+    numbers = numbers_of(scene)
     held = jnp.zeros((count,), bool) if support is None else numbers == support.index
     touched = (abs(here.gap) <= 16.0 * here.noise) | (numbers == struck) | held
     pick: Callable = lambda values: values  # noqa: E731

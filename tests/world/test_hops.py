@@ -21,7 +21,8 @@ from nonholo_jax import (
     simulate,
     simulate_batch,
 )
-from nonholo_jax._motion.loop import _stopped, _unmarked, hopped, start
+from nonholo_jax._motion.hopping import _stopped, _unmarked, hopped
+from nonholo_jax._motion.loop import start
 
 BALL = Ball(0.1, 0.5)
 SLOPE = (0.6, 0.0, 0.8)

@@ -21,8 +21,8 @@ from nonholo_jax import (
     simulate,
     simulate_batch,
 )
-from nonholo_jax._world.stack import Stack, stacked
 from nonholo_jax._world.surface import AbstractSurface
+from nonholo_jax._world.touching import Stack, stacked
 
 BALL = Ball(0.05, 0.7)
 UP = (0.0, 0.0, 1.0)
