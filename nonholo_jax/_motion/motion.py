@@ -97,7 +97,7 @@ class Exact(AbstractMotion):
     @staticmethod
     def serves(system: AbstractSystem) -> bool:
         """Whether it can move this system."""
-        return system.is_uniform() and all(system.is_bounded(i) for i in range(system.n_contacts))
+        return system.is_uniform() and not system.unbounded(None)
 
     def check(self, system):
         if not system.is_uniform():

@@ -19,6 +19,7 @@ from .._math import (
     components,
     frozen,
     gradient_of,
+    is_bounded,
     is_constant,
     reach_of,
     value_of,
@@ -323,8 +324,12 @@ class LagrangianSystem(AbstractSystem):
     def bend(self, contact, time, window, state):
         return bend_of(self.barriers[contact].gap, self.barriers[contact].curvature, window)
 
-    def is_bounded(self, contact):
-        return self.barriers[contact].curvature is not None
+    def is_wide(self, contact):
+        return self.barriers[contact].curvature is None
+
+    def unbounded(self, state):
+        n = state[0].shape[-1]
+        return [f"barrier {i}" for i, each in enumerate(self.barriers) if not is_bounded(each.gap, each.curvature, n)]
 
     def extent(self, contact):
         return 0.0

@@ -22,6 +22,7 @@ from .._math import (
     components,
     dot,
     gradient_of,
+    is_bounded,
     is_constant,
     norm,
     pack,
@@ -121,6 +122,10 @@ class AbstractSurface(eqx.Module):
     def is_bounded(self) -> bool:
         """Whether `bend` is a true bound, not an estimate from samples."""
         return getattr(self, "curvature", 0.0) is not None
+
+    def is_wide(self) -> bool:
+        """Whether `bend` may be too wide to take a step by, or even `BLIND`."""
+        return False
 
     def gap(self, x: Vector, t: float | Scalar = 0.0, radius: float | Scalar = 0.0) -> Scalar:
         """Signed distance from the skin of a ball of `radius` (in m) centred at `x` (shape (3,), in m) to the surface,
@@ -224,6 +229,10 @@ def _depends_on_time(gap: Any) -> bool:
     return False
 
 
+def _at_start(gap: Any, x: Any) -> Any:
+    return gap(x, 0.0)
+
+
 class Implicit(AbstractSurface):
     """Any surface, given as the zeros of a smooth function of the ball's centre.
 
@@ -285,6 +294,13 @@ class Implicit(AbstractSurface):
 
     def bend(self, window, t, radius):
         return bend_of(lambda p: self.function(p, t), self.curvature, window)
+
+    def is_bounded(self):
+        gap = jax.tree_util.Partial(_at_start, self.function)
+        return is_bounded(gap, self.curvature, 3)
+
+    def is_wide(self):
+        return self.curvature is None
 
     def extent(self):
         return 0.0
