@@ -7,6 +7,7 @@ number has a kink its second derivative is a bound of what it is beside the kink
 and infinite on the other: the rate jumps.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -27,6 +28,7 @@ from .intervals import (
     point,
     product_of,
     real_power_of,
+    sine_of,
     softplus_of,
     weighed,
     whole_power,
@@ -34,6 +36,7 @@ from .intervals import (
     widened,
 )
 from .polynomial import Interval
+from .shared import shared
 
 
 class Course(NamedTuple):
@@ -68,7 +71,12 @@ def enclosed(
     value, rate, bend = _known(value), _known(rate), _known(bend)
     pace = jnp.clip(jnp.where(jnp.isnan(pace), 0.0, pace), rate.low, rate.high)
     rate = widened(meet(rate, _spread(pace, bend, width)))
-    return Course(widened(meet(value, _spread(start, rate, width))), rate, bend, start, pace, squares)
+    value = widened(meet(value, _spread(start, rate, width)))
+    if start.size == 1:  # each is used many times over; arrays rather pass through once
+        parts = shared([*value, *rate, *bend, start, pace])
+        value, rate, bend = (Interval(*parts[k : k + 2]) for k in (0, 2, 4))
+        start, pace = parts[6:]
+    return Course(value, rate, bend, start, pace, squares)
 
 
 def _known(a: Interval) -> Interval:
@@ -120,9 +128,12 @@ def multiplied(width: Any, a: Course, b: Course) -> Course:
 
 def of_function(width: Any, values: Values, a: Course, function: Callable) -> Course:
     """A function of a, from what it does over the values of a."""
+    return _composed(width, values, a, *jax.jvp(function, (a.start,), (a.pace,)))
+
+
+def _composed(width: Any, values: Values, a: Course, start: Any, pace: Any) -> Course:
     rate = product_of(values.slope, a.rate)
     bend = plus_each(weighed(whole_power(a.rate, 2), values.bend), product_of(values.slope, a.bend))
-    start, pace = jax.jvp(function, (a.start,), (a.pace,))
     return enclosed(width, values.value, rate, bend, start, pace)
 
 
@@ -141,6 +152,15 @@ def rooted(width: Any, values: Values, a: Course, function: Callable) -> Course:
     rate = meet(root.rate, widened(Interval(-fastest, fastest)))
     bend = root.bend._replace(low=jnp.maximum(root.bend.low, -hardest))
     return enclosed(width, root.value, rate, bend, root.start, root.pace)
+
+
+def sine(width: Any, a: Course) -> Course:
+    value, slope = shared([jnp.sin(a.start), jnp.cos(a.start)])
+    return _composed(width, sine_of(a.value, a.start, value, slope), a, value, slope * a.pace)
+
+
+def cosine(width: Any, a: Course) -> Course:
+    return sine(width, shifted(a, math.pi / 2.0))
 
 
 def to_whole_power(width: Any, a: Course, n: int, function: Callable) -> Course:

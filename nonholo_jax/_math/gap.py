@@ -86,7 +86,8 @@ def _safe(course: Course, window: Window) -> Interval:
     reached = where(steepest < 0, start / where(steepest < 0, -steepest, 1.0), jnp.inf)
     free = (course.value.low > 0) | (reached >= width)
     zero = jnp.maximum(where(free, 1.001 * width, reached), tiny)
-    first = -2.0 * (start + course.pace * zero) / (zero * zero)
+    ahead = start + course.pace * zero  # of where that rate alone would bring it; less only by rounding
+    first = -2.0 * where(free, ahead, jnp.maximum(ahead, 0.0)) / (zero * zero)
     low = jnp.maximum(course.bend.low, where(jnp.isnan(first), -jnp.inf, first))
     most = jnp.maximum(jnp.abs(course.bend.low), jnp.abs(course.bend.high))
     return Interval(jnp.clip(low, BLIND, -BLIND), jnp.minimum(most, -BLIND))
