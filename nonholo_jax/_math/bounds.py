@@ -180,7 +180,7 @@ _SPECIAL = {"hypot": (jnp.hypot, length), "logaddexp": (jnp.logaddexp, soft_larg
 
 _STRUCTURAL = {"reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "slice", "rev", "copy", "copy_p",
                "concatenate", "pad", "gather", "dynamic_slice", "dynamic_update_slice", "scatter", "split",
-               "reduce_sum", "cumsum", "scatter-add", "stop_gradient", "optimization_barrier", "shared"}  # fmt: skip
+               "stack", "unstack", "tile", "reduce_sum", "cumsum", "scatter-add", "stop_gradient", "optimization_barrier", "shared"}  # fmt: skip
 
 
 def _rearranged(eqn: Any, operands: list) -> Any:

@@ -141,7 +141,7 @@ def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, wind
         width = where(left_behind & (rate <= 0), 1e-7 * width, width)
     bend = system.bend(contact, arc.time, Window(coefficients, width), arc.start)
     m, most = (jnp.asarray(x, dtype=s.dtype) for x in bend)
-    look = None
+    look, least = None, 0.0
     if system.is_wide(contact):
         # Where nothing is known at all, because the path comes too near a point where the gap has no derivative, only
         # a closer look helps; a window that is next to nothing is passed.
@@ -160,6 +160,8 @@ def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, wind
     found = closes & (sharpest * value * value <= noise * rate * rate) & (comes <= width)
     near = (value <= noise) & ((closes & (zero <= width)) | ((rate == 0) & (m < 0)))
     hit = near | found
+    if look is not None:  # whether a bounce would rise again is not for a bound to say that is much too wide
+        hit = hit & ((rate * rate > -2.0 * m * noise) | (width <= least))
     last = where(closes, jnp.minimum(jnp.minimum(comes, zero), left), 0.0)
     size, clear = where(hit, last, jnp.minimum(zero, width)), zero >= width
     back = _return(system, contact, arc)
