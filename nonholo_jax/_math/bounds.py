@@ -12,6 +12,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -39,6 +40,7 @@ from .courses import (
     soft_larger,
     squared,
     stepped,
+    summed,
     to_real_power,
     to_whole_power,
 )
@@ -47,6 +49,7 @@ from .polynomial import Interval, Window
 from .vector import frozen, is_constant
 
 _MOST_ENTRIES = 1 << 14  # of a product of matrices, written out
+_MOST_FACTORS = 16  # of a product of numbers
 
 
 class Unbounded(Exception):
@@ -60,9 +63,10 @@ def course_of(function: Callable, window: Window) -> Course:
     dtype = jnp.result_type(*[x for x in (*start, window.width) if not is_constant(x)] or [float])
     stack = lambda xs: jnp.stack([jnp.asarray(x, dtype=dtype) for x in xs])  # noqa: E731
     tracks = [window.track(p) for p in window.coefficients]
-    parts = [Interval(stack([part.low for part in each]), stack([part.high for part in each]))
-             for each in zip(*tracks, strict=True)]  # fmt: skip
-    path = Course(*parts, stack(start), stack([p[1] if len(p) > 1 else 0.0 for p in window.coefficients]))
+    value, rate, bend = (Interval(stack([part.low for part in each]), stack([part.high for part in each]))
+                         for each in zip(*tracks, strict=True))  # fmt: skip
+    pace = stack([p[1] if len(p) > 1 else 0.0 for p in window.coefficients])
+    path = Course(value, rate, bend, stack(start), pace)
     closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct(path.start.shape, dtype))
     width = jnp.maximum(jnp.asarray(window.width, dtype), float(jnp.finfo(dtype).tiny))  # no infinity times nothing
     (found,) = _run(width, closed.jaxpr, frozen(closed.consts), [path])
@@ -179,8 +183,9 @@ _SPECIAL = {"hypot": (jnp.hypot, length), "logaddexp": (jnp.logaddexp, soft_larg
 # What moves numbers about, and sums them: the same for values, rates and second derivatives
 
 _STRUCTURAL = {"reshape", "squeeze", "expand_dims", "broadcast_in_dim", "transpose", "slice", "rev", "copy", "copy_p",
-               "concatenate", "pad", "gather", "dynamic_slice", "dynamic_update_slice", "scatter", "split",
-               "stack", "unstack", "tile", "reduce_sum", "cumsum", "scatter-add", "stop_gradient", "optimization_barrier", "shared"}  # fmt: skip
+               "concatenate", "stack", "unstack", "tile", "split", "pad", "gather", "dynamic_slice",
+               "dynamic_update_slice", "scatter", "scatter-add", "cumsum", "stop_gradient",
+               "optimization_barrier", "shared"}  # fmt: skip
 
 
 def _rearranged(eqn: Any, operands: list) -> Any:
@@ -193,12 +198,13 @@ def _rearranged(eqn: Any, operands: list) -> Any:
         found = _bind(eqn, *[of(x) if isinstance(x, Course) else x for x in courses])
         return list(found) if eqn.primitive.multiple_results else [found]
 
-    fields = [[part(lambda x, k=k, j=j: x[k][j]) for j in (0, 1)] for k in (0, 1, 2)]
+    value, rate, bend = ([part(lambda x, k=k, j=j: x[k][j]) for j in (0, 1)] for k in (0, 1, 2))
     start, pace = part(lambda x: x.start), part(lambda x: x.pace)
-    squares = [None] * len(start)
+    squares: list = [None] * len(start)
     if not any(numbers) and all(x.squares is not None for x in courses if isinstance(x, Course)):
         squares = list(zip(*[part(lambda x, j=j: x.squares[j]) for j in (0, 1)], strict=True))
-    return [Course(*[Interval(low[i], high[i]) for low, high in fields], start[i], pace[i], squares[i])
+    pair = lambda ends, i: Interval(ends[0][i], ends[1][i])  # noqa: E731
+    return [Course(pair(value, i), pair(rate, i), pair(bend, i), start[i], pace[i], squares[i])
             for i in range(len(start))]  # fmt: skip
 
 
@@ -237,7 +243,7 @@ def _sign_of(c: Any) -> float | None:
     """The sign of a constant, if it is known now and the same everywhere."""
     if isinstance(c, jax.core.Tracer):
         return None
-    if isinstance(c, jax.Array) and not c.is_fully_addressable:
+    if isinstance(c, jax.Array) and not c.is_fully_addressable:  # on other machines
         return None
     c = np.asarray(c)
     return 1.0 if (c >= 0).all() else -1.0 if (c <= 0).all() else None
@@ -277,6 +283,24 @@ def _pow(width: Any, eqn: Any, a: Any, b: Any) -> Course:
     return _smooth("exp", width, exponent, jnp.exp)
 
 
+def _polynomial(width: Any, eqn: Any, x: Any, *coefficients: Any) -> Course:
+    """Horner's rule; the constant comes first."""
+    found = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        product = _mul(width, eqn, found, x) if _moves(found) or _moves(x) else found * x
+        found = _add(width, eqn, product, c) if _moves(product) or _moves(c) else product + c
+    return found
+
+
+def _prod(width: Any, eqn: Any, a: Course) -> Course:
+    for axis in sorted(eqn.params["axes"], reverse=True):
+        if a.start.shape[axis] > _MOST_FACTORS:
+            raise Unbounded("reduce_prod")
+        factors = [jax.tree.map(lambda x, i=i, axis=axis: jnp.take(x, i, axis), a) for i in range(a.start.shape[axis])]
+        a = functools.reduce(functools.partial(multiplied, width), factors)
+    return a
+
+
 def _smooth(name: str, width: Any, a: Course, function: Callable) -> Course:
     build = rooted if name == "sqrt" else of_function
     return build(width, SMOOTH[name](a.value), a, function)
@@ -313,13 +337,12 @@ def _extreme(width: Any, eqn: Any, a: Course, sign: int) -> Course:
 
 
 def _select(width: Any, eqn: Any, which: Any, *cases: Any) -> Course:
-    cases = _alike(*cases)  # pyright: ignore
-    if isinstance(which, Truth):
-        return either(which, cases[1], cases[0])
     if isinstance(which, Course):
         raise Unbounded("select_n")
-    cases = [x._replace(squares=None) for x in cases]
-    return jax.tree.map(lambda *xs: jax.lax.select_n(which, *xs), *cases)
+    courses = [x._replace(squares=None) for x in _alike(*cases)]
+    if isinstance(which, Truth):
+        return either(which, courses[1], courses[0])
+    return jax.tree.map(lambda *xs: jax.lax.select_n(which, *xs), *courses)
 
 
 def _less(width: Any, eqn: Any, a: Any, b: Any) -> Truth:
@@ -361,34 +384,27 @@ def _convert(width: Any, eqn: Any, a: Course) -> Course:
 
 
 def _dot(width: Any, eqn: Any, a: Any, b: Any) -> Course:
-    """A product of matrices, written out as products of numbers and their sum."""
+    """A product of matrices, written out as products of numbers and their sum. Axes: those of the batch, the free ones
+    of a, the free ones of b, and those that are summed."""
     (left, right), (left_batch, right_batch) = eqn.params["dimension_numbers"]
-    ranks = [len(atom.aval.shape) for atom in eqn.invars]
-    free = [[i for i in range(rank) if i not in (*used, *batch)]
-            for rank, used, batch in zip(ranks, (left, right), (left_batch, right_batch), strict=True)]  # fmt: skip
-    n, m, k = len(left_batch), len(free[0]), len(free[0]) + len(free[1])
-
-    def spread(x: Any, order: tuple, before: int, after: int) -> Any:
-        """Batch axes, free axes of a, free axes of b, and those that are summed."""
-        x = jnp.transpose(x, order)
-        at = n if before else n + m
-        return jnp.expand_dims(x, tuple(range(at, at + (before or after))))
-
-    orders = [(*left_batch, *free[0], *left), (*right_batch, *free[1], *right)]
-    gaps = [(0, k - m), (m, 0)]
-    shapes = []
-    operands = []
-    for x, order, gap in zip((a, b), orders, gaps, strict=True):
-        wide = functools.partial(spread, order=order, before=gap[0], after=gap[1])
-        operands.append(jax.tree.map(wide, x) if isinstance(x, Course) else wide(jnp.asarray(x)))
-        shapes.append((operands[-1].start if isinstance(x, Course) else operands[-1]).shape)
-    shape = jnp.broadcast_shapes(*shapes)
-    if math.prod(shape) > _MOST_ENTRIES:
+    shapes = [atom.aval.shape for atom in eqn.invars]
+    free = [[i for i in range(len(shape)) if i not in (*used, *batch)]
+            for shape, used, batch in zip(shapes, (left, right), (left_batch, right_batch), strict=True)]  # fmt: skip
+    n, m, k = len(left_batch), len(free[0]), len(free[1])
+    sizes = [[shapes[0][i] for i in (*left_batch, *free[0])], [shapes[1][i] for i in free[1]]]
+    whole = (*sizes[0], *sizes[1], *[shapes[0][i] for i in left])
+    if math.prod(whole) > _MOST_ENTRIES:
         raise Unbounded("dot_general")
-    operands = [jax.tree.map(lambda y: jnp.broadcast_to(y, shape), x) for x in operands]
-    product = squared(width, operands[0]) if a is b and orders[0] == orders[1] else _mul(width, eqn, *operands)
-    axes = tuple(range(n + k, len(shape)))
-    return jax.tree.map(lambda x: jnp.sum(x, axes), product)
+
+    def spread(x: Any, order: tuple, new: range) -> Any:
+        wide = lambda y: jnp.broadcast_to(jnp.expand_dims(jnp.transpose(y, order), tuple(new)), whole)  # noqa: E731
+        return jax.tree.map(wide, x) if isinstance(x, Course) else wide(jnp.asarray(x))
+
+    c = spread(a, (*left_batch, *free[0], *left), range(n + m, n + m + k))
+    d = spread(b, (*right_batch, *free[1], *right), range(n, n + m))
+    product = squared(width, c) if a is b and m + k == 0 and tuple(left) == tuple(right) else _mul(width, eqn, c, d)
+    axes = tuple(range(n + m + k, len(whole)))
+    return summed(width, jax.tree.map(lambda x: jnp.sum(x, axes), product))
 
 
 _RULES: dict[str, Callable] = {
@@ -401,6 +417,9 @@ _RULES: dict[str, Callable] = {
     "square": lambda width, eqn, a: squared(width, a),
     "integer_pow": lambda width, eqn, a: to_whole_power(width, a, eqn.params["y"], functools.partial(_bind, eqn)),
     "pow": _pow,
+    "polynomial": _polynomial,
+    "one_minus_square": lambda width, eqn, a: shifted(opposite(squared(width, a)), jnp.ones_like(a.start)),
+    "reduce_prod": _prod,
     "sin": lambda width, eqn, a: sine(width, a),
     "cos": lambda width, eqn, a: cosine(width, a),
     "atan2": lambda width, eqn, a, b: angle(width, *_alike(a, b)),
@@ -415,6 +434,7 @@ _RULES: dict[str, Callable] = {
     "rem": _rem,
     "convert_element_type": _convert,
     "dot_general": _dot,
+    "reduce_sum": lambda width, eqn, a: summed(width, _rearranged(eqn, [a])[0]),
     **{name: _of_smooth(name) for name in SMOOTH},
     **{name: _less for name in ("lt", "le", "gt", "ge", "eq", "ne")},
     **{name: _steps for name in ("floor", "ceil", "round", "sign")},

@@ -92,8 +92,13 @@ def moved(width: Any, a: Course, b: Course) -> Course:
     squares = None
     if a.squares is not None and b.squares is not None:
         squares = (a.squares[0] + b.squares[0], a.squares[1] + b.squares[1])
-    parts = [plus_each(x, y) for x, y in zip(a[:3], b[:3], strict=True)]
-    return enclosed(width, *parts, a.start + b.start, a.pace + b.pace, squares)
+    value, rate, bend = (plus_each(x, y) for x, y in zip(a[:3], b[:3], strict=True))
+    return enclosed(width, value, rate, bend, a.start + b.start, a.pace + b.pace, squares)
+
+
+def summed(width: Any, a: Course) -> Course:
+    """A sum, from the sums of all parts."""
+    return enclosed(width, a.value, a.rate, a.bend, a.start, a.pace, a.squares)
 
 
 def shifted(a: Course, c: Any) -> Course:

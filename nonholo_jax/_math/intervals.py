@@ -59,7 +59,7 @@ def greatest(a: Interval) -> Any:
 
 def widened(a: Interval) -> Interval:
     """The interval with what rounding may have cut off."""
-    margin = _ROUNDINGS * float(jnp.finfo(a.low.dtype).eps) * greatest(a)
+    margin = _ROUNDINGS * float(jnp.finfo(jnp.result_type(a.low)).eps) * greatest(a)
     margin = jnp.where(jnp.isfinite(margin), margin, 0.0)
     return Interval(a.low - margin, a.high + margin)
 
@@ -172,6 +172,10 @@ def _log(a: Interval) -> Values:
     return Values(_rising(jnp.log, a), r, negative(whole_power(r, 2)))
 
 
+def _log2(a: Interval) -> Values:
+    return Values(*[_times(1.0 / math.log(2.0), part) for part in _log(a)])
+
+
 def _log1p(a: Interval) -> Values:
     a = _above(a, -1.0)
     r = reciprocal(Interval(1.0 + a.low, 1.0 + a.high))
@@ -231,9 +235,9 @@ def _tanh(a: Interval) -> Values:
 
 def _logistic(a: Interval) -> Values:
     s, mirrored = _rising(jax.nn.sigmoid, a), _rising(jax.nn.sigmoid, negative(a))
-    slope = Interval(jnp.minimum(s.low * mirrored.high, s.high * mirrored.low), jnp.full_like(s.low, 0.25))
-    slope = slope._replace(high=jnp.where((a.low <= 0) & (a.high >= 0), 0.25, jnp.maximum(s.low * mirrored.high,
-                                                                                         s.high * mirrored.low)))  # fmt: skip
+    ends = s.low * mirrored.high, s.high * mirrored.low
+    most = jnp.where((a.low <= 0) & (a.high >= 0), 0.25, jnp.maximum(*ends))
+    slope = Interval(jnp.minimum(*ends), most)
     lean = Interval(mirrored.low - s.high, mirrored.high - s.low)
     return Values(s, slope, weighed(slope, lean))
 
@@ -297,8 +301,8 @@ def _asinh(a: Interval) -> Values:
 
 
 SMOOTH: dict[str, Callable[[Interval], Values]] = {
-    "exp": _exp, "exp2": _exp2, "expm1": _expm1, "log": _log, "log1p": _log1p, "sqrt": _sqrt, "rsqrt": _rsqrt,
-    "cbrt": _cbrt, "tan": _tan, "tanh": _tanh, "logistic": _logistic, "erf": _erf,
-    "erfc": _erfc, "atan": _atan, "asin": _asin, "acos": _acos, "sinh": _sinh, "cosh": _cosh, "asinh": _asinh,
+    "exp": _exp, "exp2": _exp2, "expm1": _expm1, "log": _log, "log2": _log2, "log1p": _log1p, "sqrt": _sqrt,
+    "rsqrt": _rsqrt, "cbrt": _cbrt, "tan": _tan, "tanh": _tanh, "logistic": _logistic, "erf": _erf, "erfc": _erfc,
+    "atan": _atan, "asin": _asin, "acos": _acos, "sinh": _sinh, "cosh": _cosh, "asinh": _asinh,
 }  # fmt: skip
 """Elementary functions by the names of JAX's primitives."""

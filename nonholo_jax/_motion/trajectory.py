@@ -51,6 +51,8 @@ class Trajectory(eqx.Module):
     - `impacts`: an `ImpactLog`; `n_impacts`, how many rows there were (the log may hold fewer). A train is one.
     - `n_arcs`: pieces of smooth motion computed: flights with `Exact`, accepted steps with `Integrated`.
     - `result`: one of `RESULTS`.
+    - `is_bounded`: a bool of Python, one for a whole batch: whether every crossing was found with true bounds, so that
+        none can have been passed. False if there is a gap that `UnboundedGapWarning` names.
     - `t0`, `initial`, `system`, `motion`: what the motion began with.
     """
 
@@ -65,6 +67,7 @@ class Trajectory(eqx.Module):
     system: Any  # an AbstractSystem
     motion: Any  # an AbstractMotion
     mapped: tuple[bool, ...] | None = eqx.field(static=True, default=None)
+    is_bounded: bool = eqx.field(static=True, default=True)
 
     def at(self, t: Any) -> Any:
         """The state at time `t` in s (scalar or array), exact between impacts: the motion is taken up at the impact

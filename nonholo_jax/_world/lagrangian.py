@@ -59,8 +59,8 @@ class Barrier(eqx.Module):
         inside the wall (B stops the motion towards it) and inside that of the system, ker A.
     - `restitution`: mu in [0, 1]: 0 is plastic, 1 conserves the energy.
     - `offset`: `offset(q, t) -> c`, shape (k,), for a wall that moves along itself: B v = c. `None` is zero.
-    - `curvature`: a bound of the norm of the second derivative of the gap. With it no crossing is ever passed; without
-        it the second derivative along each step is estimated from five samples with their spread as margin.
+    - `curvature`: a bound of the norm of the second derivative of the gap, with which no crossing is ever passed.
+        `None` takes bounds from the program of the gap, as for `Implicit`, and samples where that cannot be done.
 
     Raises `ValueError` for a restitution out of range and a negative curvature. Source: the paper, sections 2 and 6.
 

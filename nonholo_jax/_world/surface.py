@@ -242,14 +242,17 @@ class Implicit(AbstractSurface):
         contact; it need not be a distance, but its gradient must not vanish at contact. It may be an
         `equinox.Module` whose fields are traced. Raises `ValueError` if it depends on t: surfaces do not move yet.
     - `law` of contact.
-    - `curvature`: a bound in 1/m of the norm of the second derivative of the function. With it no crossing is ever
-        passed. Without it `Exact` refuses the surface; `Integrated` then bounds the second derivative along each step
-        from five samples with their spread as margin, which can pass a bump much narrower than a step.
+    - `curvature`: a bound in 1/m of the norm of the second derivative of the function; no crossing is then passed.
+        Nor without it, if the function is made of arithmetic, powers, norms, sums, products of matrices, elementary
+        functions, minima and maxima: bounds then come from its own program, and are often tighter. (Points near which
+        even its rate is not bounded, such as jumps and poles, are passed in windows of eps^(3/4) of the arc.) Other
+        functions (with loops, sorting, or tables looked up at x) are sampled five times a step, which can pass a bump
+        narrower than that: `UnboundedGapWarning` says so, `Trajectory.is_bounded` too, and `Exact` refuses them.
 
     ```python
     import jax.numpy as jnp
     from nonholo_jax import Implicit, Rough
-    hills = Implicit(lambda x, t: x[2] - 0.1 * jnp.sin(x[0]) - 0.05, Rough(), curvature=0.1)
+    hills = Implicit(lambda x, t: x[2] - 0.1 * jnp.sin(x[0]) - 0.05, Rough())
     ```
     """
 
