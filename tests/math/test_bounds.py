@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nonholo_jax._math import Window, evaluate
+from nonholo_jax._math import Window, bend_of, evaluate
 from nonholo_jax._math.bounds import Unbounded, course_of, is_boundable
+from nonholo_jax._motion.crossing import _first_zero
 
 MATRIX = np.random.default_rng(0).normal(size=(6, 3))
 PLACES = np.array([[0.3, 0.1, 0.0], [-1.0, 0.4, 0.2], [0.5, -0.8, 0.9], [0.0, 1.5, -0.3]])
@@ -118,6 +119,32 @@ def test_bounds_close_in_linearly_on_the_second_derivative(name):
     bend = jax.jit(both)(windows(8, jnp.float64)[0], jnp.asarray(widths)).bend
     slopes = np.polyfit(np.log(widths), np.log(np.asarray(bend.high - bend.low)).T, 1)[0]
     assert np.median(slopes) == pytest.approx(1.0, abs=0.2)
+
+
+@dtypes
+@pytest.mark.parametrize("name", ["ridge", "waves", "torus", "box", "nearest", "pole"])
+def test_a_step_by_the_bounds_never_passes_a_zero(name, dtype):
+    """The parabola with them has its first zero no later than the function; also where it begins on one, whatever
+    rounding makes of that."""
+    paths, widths = windows(400, dtype)
+    rises = np.random.default_rng(4).choice([0.0, 0.0, 1e-3, 0.1, 1.0], 400)
+
+    def one(path, width, rise):
+        function = {**SMOOTH, **ROUGH}[name]
+        start = function(path[:, 0])
+        gap = lambda x: function(x) - start + rise  # noqa: E731
+        value, rate, _ = samples(gap)(path, width)
+        return value, rate, bend_of(gap, None, window(path, width))
+
+    value, rate, bend = jax.jit(jax.vmap(one))(paths, widths, jnp.asarray(rises, dtype))
+    off = 4.0 * float(jnp.finfo(dtype).eps)  # the search and the bounds may round the value in two ways
+    first = np.asarray(_first_zero(jnp.maximum(value[:, 0], 0.0) + off, rate[:, 0], bend.low))
+    noise = 64.0 * float(jnp.finfo(dtype).eps) * (1.0 + np.abs(np.asarray(value)).max(axis=1))
+    negative = np.asarray(value) < -noise[:, None]
+    crossed = negative.any(axis=1) & np.isfinite(np.asarray(value)).all(axis=1)
+    when = np.asarray(widths) * negative.argmax(axis=1) / (value.shape[1] - 1)
+    assert crossed.sum() > 50
+    assert (first[crossed] <= when[crossed]).all()
 
 
 def test_alone_compiled_and_in_a_batch_bounds_agree():

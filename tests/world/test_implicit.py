@@ -160,6 +160,12 @@ PAST = {  # gap, position, velocity, number of impacts within a second
     "the edges of a block": (block, [-1.0, -1.0, 0.5], [2.0, 1.95, 1.0], 1),
     "the kinks inside a block": (block, [-0.1, 0.05, 1.0], [0.1, 0.0, 0.0], 2),
     "jumps of a period": (rods, [-1.0, 0.0, 1.0], [2.3, 0.0, 0.0], 1),
+    "jumps that cancel": (
+        lambda x, t: x[2] + 5.0 * jnp.sign(x[0]) - 5.0 * jnp.sign(x[0]),
+        [-0.5, 0.0, 1.0],
+        [2.0, 0.0, 4.0],
+        0,
+    ),
     "a pole": (lambda x, t: x[2] + 10.0 + 1.0 / x[0] ** 2, [-0.5, 0.0, 1.0], [2.0, 0.0, 0.0], 0),
 }
 
