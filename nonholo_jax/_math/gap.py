@@ -49,7 +49,7 @@ def is_bounded(gap: Callable, curvature: Number | None, n: int) -> bool:
         return is_boundable(gap, n)
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=64)
 def _is_boundable(structure: Any, kinds: tuple, n: int) -> bool:
     """The answer goes by the program alone, not by the numbers in it; whoever runs a scene asks often."""
     leaves = [jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x for x in kinds]

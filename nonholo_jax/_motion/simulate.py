@@ -148,7 +148,8 @@ def simulate_batch(
     _check_scene(scene, axes)
     one_scene = all(axis is None for axis in axes)
     wanted, slides = None if accuracy is None else (accuracy, states, t0, t1), sum_trains and one_scene
-    motion, log_rows = checked(scene, motion, max_impacts, log_size, slides=slides, wanted=wanted)
+    first = scene if one_scene else _first(scene, axes)
+    motion, log_rows = checked(first, motion, max_impacts, log_size, slides=slides, wanted=wanted)
     system = _continued(scene, motion, sum_trains)
     states = scene.received(states, batch=True, t0=t0)
     dtype = jax.tree.leaves(states)[0].dtype
@@ -156,8 +157,17 @@ def simulate_batch(
     _check_times(t0, t1)
     devices = free_devices((system, motion, states, t0, t1))
     trajectory = _run_batch(system, motion, states, t0, t1, axes, max_impacts, log_rows, adjoint, devices)
-    trajectory = _told(trajectory, scene.unbounded(states))
+    trajectory = _told(trajectory, first.unbounded(states))
     return _raised(trajectory) if throw else trajectory
+
+
+def _first(scene: AbstractSystem, axes: tuple) -> AbstractSystem:
+    """The first of many scenes, whose gaps are then functions of one point."""
+    if not isinstance(scene, AbstractSystem) or not any(scene.is_wide(i) for i in range(scene.n_contacts)):
+        return scene
+    leaves, treedef = jax.tree.flatten(scene)
+    return jax.tree.unflatten(treedef, [leaf if axis is None else jax.lax.index_in_dim(leaf, 0, axis, keepdims=False)
+                                        for leaf, axis in zip(leaves, axes, strict=True)])  # fmt: skip
 
 
 def _told(trajectory: Trajectory, unbounded: list[str]) -> Trajectory:

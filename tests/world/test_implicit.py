@@ -3,6 +3,7 @@ bounded by its own program."""
 
 import warnings
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -207,6 +208,27 @@ def test_a_gap_that_is_differentiated_may_be_bounded_by_its_program(transform):
     own, given = (transform(lambda h, c=c: landing(h, c))(jnp.asarray(0.2)) for c in (None, 0.2))
     assert abs(float(own)) > 0.1
     np.testing.assert_allclose(own, given, rtol=1e-9)
+
+
+def test_many_scenes_are_each_bounded_by_the_program():
+    heights, throws = jnp.array([0.1, 0.2, 0.3]), sampled_throws(3)
+    scenes = alone(Hill(heights), Rough(0.7))
+    axes = jax.tree.map(lambda _: 0, scenes)
+    many = simulate_batch(scenes, throws, t1=1.0, scene_axes=axes)
+    assert many.is_bounded and isinstance(many.motion, Exact)
+    for i, height in enumerate(heights):
+        one = simulate(alone(Hill(height), Rough(0.7)), jax.tree.map(lambda x, i=i: x[i], throws), t1=1.0)
+        np.testing.assert_allclose(many.final.position[i], one.final.position, rtol=1e-9)
+
+
+@pytest.mark.parametrize("adjoint", [diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()])
+def test_the_loop_itself_may_be_differentiated(adjoint):
+    transform = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.grad
+    throw = BallState([0.0, 0.0, 1.0], [1.0, 0.2, 0.0], AT_REST)
+
+    wanted = jax.grad(lambda h: simulate(alone(Hill(h), Rough(0.7)), throw, t1=0.8).final.position[2])(jnp.asarray(0.2))
+    module = lambda h: simulate(alone(Hill(h), Rough(0.7)), throw, t1=0.8, adjoint=adjoint).final.position[2]  # noqa: E731
+    np.testing.assert_allclose(transform(module)(jnp.asarray(0.2)), wanted, rtol=1e-9)
 
 
 @pytest.mark.parametrize("n", [2, 4])
