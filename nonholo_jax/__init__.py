@@ -20,6 +20,7 @@ from ._motion import (
     Integrated as Integrated,
     SimulationError as SimulationError,
     Trajectory as Trajectory,
+    UnboundedGapWarning as UnboundedGapWarning,
     simulate as simulate,
     simulate_batch as simulate_batch,
 )

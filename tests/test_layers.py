@@ -13,7 +13,20 @@ import nonholo_jax
 PACKAGE = pathlib.Path(nonholo_jax.__file__).parent
 # From the ground up, and so in each room.
 ROOMS = {
-    "_math": ["types", "vector", "shared", "hops", "polynomial", "gap", "rotation", "tiles", "tangents"],
+    "_math": [
+        "types",
+        "vector",
+        "shared",
+        "hops",
+        "polynomial",
+        "intervals",
+        "courses",
+        "bounds",
+        "gap",
+        "rotation",
+        "tiles",
+        "tangents",
+    ],
     "_impact": ["projector", "law", "together", "train", "rolling"],
     "_world": [
         "ball",

@@ -1,6 +1,13 @@
 """Mathematics without a ball: triples of scalars, sharing, polynomials, bounds, rotations, tiles, tangents, words."""
 
-from .gap import bend_of as bend_of, gradient_of as gradient_of, reach_of as reach_of, value_of as value_of
+from .gap import (
+    BLIND as BLIND,
+    bend_of as bend_of,
+    gradient_of as gradient_of,
+    is_bounded as is_bounded,
+    reach_of as reach_of,
+    value_of as value_of,
+)
 from .hops import (
     ENDS as ENDS,
     FULL as FULL,

@@ -5,6 +5,7 @@ from .motion import AbstractMotion as AbstractMotion, Exact as Exact
 from .replay import run as run
 from .simulate import (
     SimulationError as SimulationError,
+    UnboundedGapWarning as UnboundedGapWarning,
     checked as checked,
     simulate as simulate,
     simulate_batch as simulate_batch,

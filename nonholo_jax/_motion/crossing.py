@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from .._math import (
+    BLIND,
     Index,
     Number,
     Polynomial,
@@ -78,6 +79,7 @@ class _Step(NamedTuple):
     bend: Number
     noise: Number
     exact: Any
+    look: Any = None  # how far at least to look ahead next, where the bound may have been too wide to take a step by
 
 
 class _Here(NamedTuple):
@@ -139,6 +141,12 @@ def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, wind
         width = where(left_behind & (rate <= 0), 1e-7 * width, width)
     bend = system.bend(contact, arc.time, Window(coefficients, width), arc.start)
     m, most = (jnp.asarray(x, dtype=s.dtype) for x in bend)
+    look, least = None, 0.0
+    if system.is_wide(contact):
+        # Where nothing is known at all, because the path comes too near a point where the gap has no derivative, only
+        # a closer look helps; a window that is next to nothing is passed.
+        look, least = width / 16.0, float(jnp.finfo(s.dtype).eps) ** 0.75 * arc.length
+        m = where((m <= BLIND) & (width <= least), 0.0, m)
     value, rate, m, most, width = shared([value, rate, m, most, width])
 
     value = where(left_behind, 0.0, jnp.maximum(value, 0.0))
@@ -152,11 +160,13 @@ def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, wind
     found = closes & (sharpest * value * value <= noise * rate * rate) & (comes <= width)
     near = (value <= noise) & ((closes & (zero <= width)) | ((rate == 0) & (m < 0)))
     hit = near | found
+    if look is not None:  # whether a bounce would rise again is not for a bound to say that is much too wide
+        hit = hit & ((rate * rate > -2.0 * m * noise) | (width <= least))
     last = where(closes, jnp.minimum(jnp.minimum(comes, zero), left), 0.0)
     size, clear = where(hit, last, jnp.minimum(zero, width)), zero >= width
     back = _return(system, contact, arc)
     if back is None:
-        return _Step(size, hit, clear, rate, m, noise, False)
+        return _Step(size, hit, clear, rate, m, noise, False, look)
     falls = back.comes & left_behind
     size, hit, clear = where(falls, back.duration, size), where(falls, back.duration <= left, hit), clear & ~falls
     rate, m = where(falls, back.rise, rate), where(falls, times(-2.0, back.pull), m)
@@ -176,6 +186,13 @@ def _nearest(contacts: Any, step: Callable) -> tuple[_Step, Any]:
     steps = stack.each(start, lambda member: as_arrays(step(member)))
     nearest = jnp.argmin(steps.size).astype(jnp.int32)
     return jax.tree.map(lambda x: x[nearest], steps), start + nearest
+
+
+def _either(condition: Any, a: Any, b: Any) -> Any:
+    """`where`; `None` is nothing."""
+    if a is None and b is None:
+        return None
+    return where(condition, 0.0 if a is None else a, 0.0 if b is None else b)
 
 
 def _first_zero(value: Any, rate: Any, m: Any) -> Any:
@@ -207,10 +224,11 @@ def search(system: AbstractSystem, arc: Arc, start: Any, window: Any, touching: 
             each, number = _nearest(contacts, step_towards)
             closer = each.size < first.size  # a tie goes to the first
             contact = where(closer, number, contact)
-            first = _Step(*[where(closer, a, b) for a, b in zip(each, first, strict=True)])
+            first = _Step(*[_either(closer, a, b) for a, b in zip(each, first, strict=True)])
         end = s + first.size
         hit = first.hit & (end <= arc.length)
         ahead = where(first.clear, 4.0, 2.0) * jnp.minimum(first.size, arc.length)
+        ahead = ahead if first.look is None else jnp.maximum(ahead, first.look)
         rests, ends = _rests(first, hit, here.speed, s.dtype)
         s, finished = jnp.minimum(end, arc.length), hit | (end >= arc.length)
         found = Search(s, ahead, where(hit, contact, none), finished, rests, ends)

@@ -78,8 +78,8 @@ class Exact(AbstractMotion):
     **Arguments:** `safe_steps`, `tile`: speed only. How often one turn of the event loop may look ahead for a crossing,
     and how many lanes of a batch share one loop on a CPU.
 
-    Refuses (with `ValueError`) a scene with air, and an `Implicit` surface without a bound of its curvature. Raises
-    `ValueError` for counts below 1.
+    Refuses (with `ValueError`) a scene with air, and an `Implicit` surface whose curvature is not given and cannot be
+    bounded from its program. Raises `ValueError` for counts below 1.
 
     ```python
     from nonholo_jax import Exact
@@ -97,7 +97,7 @@ class Exact(AbstractMotion):
     @staticmethod
     def serves(system: AbstractSystem) -> bool:
         """Whether it can move this system."""
-        return system.is_uniform() and all(system.is_bounded(i) for i in range(system.n_contacts))
+        return system.is_uniform() and not system.unbounded(None)
 
     def check(self, system):
         if not system.is_uniform():

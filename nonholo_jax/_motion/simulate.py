@@ -1,6 +1,7 @@
 """The two functions that run a simulation: check, choose the motion, run, package."""
 
 import dataclasses
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -40,6 +41,10 @@ class SimulationError(RuntimeError):
     """A motion could not be computed; the message is that of its result."""
 
 
+class UnboundedGapWarning(UserWarning):
+    """A gap has a second derivative that is not bounded along a path, only sampled: a bump may be passed."""
+
+
 def simulate(
     scene: AbstractSystem,
     state: Any,
@@ -66,7 +71,8 @@ def simulate(
     - `log_size`: rows of the log; `None` for `max_impacts` and, where faces may be flush, as many hand-overs from one
         to the other; 0 for none.
     - `motion`: `Exact()` or `Integrated(...)`; `None` picks `Exact()` where the scene allows it, else `Integrated()`:
-        with air, a gap of unknown curvature, or friction on a slope, across which a ball slides along a curve.
+        with air, a gap whose curvature is neither given nor bounded by its program, or friction on a slope, across
+        which a ball slides along a curve.
     - `accuracy`: instead of `motion`, the error of the final position, in m, that is wanted: a Python number > 0. Picks
         `Exact()` where the scene allows it, else solver and tolerances that 99 of 100 throws of
         `experiments/benchmarks/bench_accuracy.py` reach it with; an expectation, no bound. Grazing throws may miss it.
@@ -80,7 +86,7 @@ def simulate(
 
     Returns a `Trajectory`. Differentiable, in both modes and to second order, in the state, the times and every number
     of the scene that is a JAX array. Raises `ValueError` for arguments that cannot be right, and `SimulationError`
-    where the motion failed (`RESULTS` says how it can).
+    where the motion failed (`RESULTS` says how it can). Warns with `UnboundedGapWarning` of a gap that is only sampled.
 
     ```python
     from nonholo_jax import Ball, BallState, Plane, Rough, Scene, simulate
@@ -100,6 +106,7 @@ def simulate(
     _check_times(t0, t1)
     move = _run_few if motion.is_closed_form and max_impacts <= _FEW_IMPACTS else _run
     trajectory = move(system, motion, state, t0, t1, max_impacts, log_rows, adjoint)
+    trajectory = _told(trajectory, scene.unbounded(state))
     return _raised(trajectory) if throw else trajectory
 
 
@@ -143,7 +150,8 @@ def simulate_batch(
     _check_scene(scene, axes)
     one_scene = all(axis is None for axis in axes)
     wanted, slides = None if accuracy is None else (accuracy, states, t0, t1), sum_trains and one_scene
-    motion, log_rows = checked(scene, motion, max_impacts, log_size, slides=slides, wanted=wanted)
+    first = scene if one_scene else _first(scene, axes)
+    motion, log_rows = checked(first, motion, max_impacts, log_size, slides=slides, wanted=wanted)
     system = _continued(scene, motion, sum_trains)
     log_rows = system.most_rows(log_rows) if log_size is None else log_rows
     states = scene.received(states, batch=True, t0=t0)
@@ -152,7 +160,30 @@ def simulate_batch(
     _check_times(t0, t1)
     devices = free_devices((system, motion, states, t0, t1))
     trajectory = _run_batch(system, motion, states, t0, t1, axes, max_impacts, log_rows, adjoint, devices)
+    trajectory = _told(trajectory, first.unbounded(states))
     return _raised(trajectory) if throw else trajectory
+
+
+def _first(scene: AbstractSystem, axes: tuple) -> AbstractSystem:
+    """The first of many scenes, whose gaps are then functions of one point."""
+    if not isinstance(scene, AbstractSystem) or not any(scene.is_wide(i) for i in range(scene.n_contacts)):
+        return scene
+    leaves, treedef = jax.tree.flatten(scene)
+    return jax.tree.unflatten(treedef, [leaf if axis is None else jax.lax.index_in_dim(leaf, 0, axis, keepdims=False)
+                                        for leaf, axis in zip(leaves, axes, strict=True)])  # fmt: skip
+
+
+def _told(trajectory: Trajectory, unbounded: list[str]) -> Trajectory:
+    """Say, now and in what is returned, which gaps were searched by samples."""
+    if not unbounded:
+        return trajectory
+    warnings.warn(
+        f"The gap of {' and '.join(unbounded)} has a second derivative that cannot be bounded from its program, only "
+        "sampled, so that a bump narrower than a step may be passed; try a bound of its norm, curvature=...",
+        UnboundedGapWarning,
+        stacklevel=3,
+    )
+    return dataclasses.replace(trajectory, is_bounded=False)
 
 
 def _continued(scene: AbstractSystem, motion: AbstractMotion, sum_trains: bool) -> AbstractSystem:

@@ -52,6 +52,8 @@ class Trajectory(eqx.Module):
     - `n_impacts`: rows that count for `max_impacts`: all but hand-overs between flush faces, `n_passed`.
     - `n_arcs`: pieces of smooth motion computed: flights with `Exact`, accepted steps with `Integrated`.
     - `result`: one of `RESULTS`.
+    - `is_bounded`: a bool of Python, one for a whole batch: whether every crossing was found with true bounds, so that
+        none can have been passed. False if there is a gap that `UnboundedGapWarning` names.
     - `t0`, `initial`, `system`, `motion`: what the motion began with.
     """
 
@@ -67,6 +69,7 @@ class Trajectory(eqx.Module):
     system: Any  # an AbstractSystem
     motion: Any  # an AbstractMotion
     mapped: tuple[bool, ...] | None = eqx.field(static=True, default=None)
+    is_bounded: bool = eqx.field(static=True, default=True)
 
     @property
     def n_rows(self) -> Any:

@@ -246,8 +246,11 @@ class Grounded(AbstractSystem):
         low, high = (where(skip, 0.0, x) for x in bend)
         return type(bend)(low, high)
 
-    def is_bounded(self, contact):
-        return contact >= self._n_surfaces or self.scene.is_bounded(contact)
+    def is_wide(self, contact):
+        return isinstance(contact, Member) and self.scene.is_wide(contact)
+
+    def unbounded(self, state):
+        return self.scene.unbounded(state)
 
     def extent(self, contact):
         return self.scene.extent(contact) if isinstance(contact, Member) else self.scene.ball.radius

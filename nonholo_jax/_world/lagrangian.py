@@ -19,6 +19,7 @@ from .._math import (
     components,
     frozen,
     gradient_of,
+    is_bounded,
     is_constant,
     reach_of,
     value_of,
@@ -58,8 +59,8 @@ class Barrier(eqx.Module):
         inside the wall (B stops the motion towards it) and inside that of the system, ker A.
     - `restitution`: mu in [0, 1]: 0 is plastic, 1 conserves the energy.
     - `offset`: `offset(q, t) -> c`, shape (k,), for a wall that moves along itself: B v = c. `None` is zero.
-    - `curvature`: a bound of the norm of the second derivative of the gap. With it no crossing is ever passed; without
-        it the second derivative along each step is estimated from five samples with their spread as margin.
+    - `curvature`: a bound of the norm of the second derivative of the gap, with which no crossing is ever passed.
+        `None` takes bounds from the program of the gap, as for `Implicit`, and samples where that cannot be done.
 
     Raises `ValueError` for a restitution out of range and a negative curvature. Source: the paper, sections 2 and 6.
 
@@ -323,8 +324,12 @@ class LagrangianSystem(AbstractSystem):
     def bend(self, contact, time, window, state):
         return bend_of(self.barriers[contact].gap, self.barriers[contact].curvature, window)
 
-    def is_bounded(self, contact):
-        return self.barriers[contact].curvature is not None
+    def is_wide(self, contact):
+        return self.barriers[contact].curvature is None
+
+    def unbounded(self, state):
+        n = state[0].shape[-1]
+        return [f"barrier {i}" for i, each in enumerate(self.barriers) if not is_bounded(each.gap, each.curvature, n)]
 
     def extent(self, contact):
         return 0.0

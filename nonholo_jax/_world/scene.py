@@ -281,8 +281,11 @@ class Scene(AbstractSystem):
     def bend(self, contact, time, window: Window, state):
         return self._surface(contact).bend(window, time, self.ball.radius)
 
-    def is_bounded(self, contact):
-        return self._surface(contact).is_bounded()
+    def is_wide(self, contact):
+        return self._surface(contact).is_wide()
+
+    def unbounded(self, state):
+        return [f"surface `{name}`" for name, surface in zip(self.names, self.surfaces) if not surface.is_bounded()]  # noqa: B905
 
     def extent(self, contact):
         return plus(self._surface(contact).extent(), self.ball.radius)

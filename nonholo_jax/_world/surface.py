@@ -22,6 +22,7 @@ from .._math import (
     components,
     dot,
     gradient_of,
+    is_bounded,
     is_constant,
     norm,
     pack,
@@ -147,6 +148,10 @@ class AbstractSurface(eqx.Module):
         """Whether `bend` is a true bound, not an estimate from samples."""
         return getattr(self, "curvature", 0.0) is not None
 
+    def is_wide(self) -> bool:
+        """Whether `bend` may be too wide to take a step by, or even `BLIND`."""
+        return False
+
     def gap(self, x: Vector, t: float | Scalar = 0.0, radius: float | Scalar = 0.0) -> Scalar:
         """Signed distance from the skin of a ball of `radius` (in m) centred at `x` (shape (3,), in m) to the surface,
         negative if it penetrates. With the default radius, the distance of the point `x`."""
@@ -256,6 +261,10 @@ def _depends_on_time(gap: Any) -> bool:
     return False
 
 
+def _at_start(gap: Any, x: Any) -> Any:
+    return gap(x, 0.0)
+
+
 class Implicit(AbstractSurface):
     """Any surface, given as the zeros of a smooth function of the ball's centre.
 
@@ -265,14 +274,17 @@ class Implicit(AbstractSurface):
         contact; it need not be a distance, but its gradient must not vanish at contact. It may be an
         `equinox.Module` whose fields are traced. Raises `ValueError` if it depends on t: surfaces do not move yet.
     - `law` of contact.
-    - `curvature`: a bound in 1/m of the norm of the second derivative of the function. With it no crossing is ever
-        passed. Without it `Exact` refuses the surface; `Integrated` then bounds the second derivative along each step
-        from five samples with their spread as margin, which can pass a bump much narrower than a step.
+    - `curvature`: a bound in 1/m of the norm of the second derivative of the function; no crossing is then passed.
+        Nor without it, if the function is made of arithmetic, powers, norms, sums, products of matrices, elementary
+        functions, minima and maxima: bounds then come from its own program, and are often tighter. (Points near which
+        even its rate is not bounded, such as jumps and poles, are passed in windows of eps^(3/4) of the arc.) Other
+        functions (with loops, sorting, or tables looked up at x) are sampled five times a step, which can pass a bump
+        narrower than that: `UnboundedGapWarning` says so, `Trajectory.is_bounded` too, and `Exact` refuses them.
 
     ```python
     import jax.numpy as jnp
     from nonholo_jax import Implicit, Rough
-    hills = Implicit(lambda x, t: x[2] - 0.1 * jnp.sin(x[0]) - 0.05, Rough(), curvature=0.1)
+    hills = Implicit(lambda x, t: x[2] - 0.1 * jnp.sin(x[0]) - 0.05, Rough())
     ```
     """
 
@@ -317,6 +329,13 @@ class Implicit(AbstractSurface):
 
     def bend(self, window, t, radius):
         return bend_of(lambda p: self.function(p, t), self.curvature, window)
+
+    def is_bounded(self):
+        gap = jax.tree_util.Partial(_at_start, self.function)
+        return is_bounded(gap, self.curvature, 3)
+
+    def is_wide(self):
+        return self.curvature is None
 
     def extent(self):
         return 0.0

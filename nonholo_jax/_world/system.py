@@ -122,9 +122,15 @@ class AbstractSystem(eqx.Module):
     def bend(self, contact: Any, time: Scalar, window: Window, state: Any) -> Interval:
         """Bounds of the second derivative of the level along the window."""
 
+    def is_wide(self, contact: Any) -> bool:
+        """Whether `bend` may be too wide to take a step by, or even `BLIND`: a closer look is then worth it."""
+        del contact
+        return False
+
     @abstractmethod
-    def is_bounded(self, contact: Any) -> bool:
-        """Whether `bend` is a true bound, not an estimate from samples."""
+    def unbounded(self, state: Any) -> list[str]:
+        """The contacts, by names for the user, whose `bend` is no true bound but an estimate from samples, for motions
+        from a user's state or a batch of them (`None`: from any)."""
 
     @abstractmethod
     def extent(self, contact: Any) -> Number:
