@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .._math import Number, Vector3, add, cross, dot, norm, ratio, scale, subtract, times
+from .._math import Number, Vector3, add, cross, dot, norm, ratio, scale, shared, subtract, times
 
 
 class Start(NamedTuple):
@@ -96,7 +96,7 @@ def slips_throughout(first: Start, contact: Contact, tolerance: float) -> Any:
     """Whether every impact slips, in one direction (but for a change of velocity of `tolerance` in m/s). What friction
     has taken after k bounces, and what is left for it to need, are linear in e_n^k: two ends decide for all k."""
     assert contact.friction is not None
-    speed = norm(first.slip)
+    speed = _speed(first)
     helped = ratio(dot(first.slip, first.along), speed)  # by gravity
     sideways = norm(subtract(first.along, scale(ratio(helped, speed), first.slip)))
     taken, lasts = _taken(first, contact), _lasts(first, contact)
@@ -121,6 +121,14 @@ def grips_throughout(first: Start, contact: Contact) -> Any:
     most = jnp.maximum(norm(start), norm(other))
     enough = (1.0 + contact.reversal) * most * first.rise <= _taken(first, contact)
     return (first.rise > 0) & (abs(rho) <= 1) & enough
+
+
+def _speed(first: Start) -> Number:
+    """The size of the slip; exactly zero where that is its rounding error, which a compiler may compute twice, as two
+    numbers, so that a direction would be one divided by the other."""
+    eps = float(jnp.finfo(jnp.result_type(*first.velocity)).eps)
+    size, of = shared([norm(first.slip), norm(first.velocity) + norm(subtract(first.velocity, first.slip))])
+    return jnp.where(size > 64.0 * eps * of, size, 0.0)
 
 
 def _taken(first: Start, contact: Contact) -> Number:
@@ -148,7 +156,7 @@ def _after(first: Start, contact: Contact, slips: Any, shrunk: Number, slip: Vec
     if contact.friction is not None:  # slipping, u_k = u_0 + change (1 - e_n^k)
         loss = _taken(first, contact) * ratio(1.0, 1.0 - restitution)
         change = scale(_lasts(first, contact), first.along)
-        change = subtract(change, scale(ratio(loss, norm(first.slip)), first.slip))
+        change = subtract(change, scale(ratio(loss, _speed(first)), first.slip))
         sums = ratio(1.0 - shrunk, 1.0 - restitution)
         slipping = add(scale(sums, first.slip), scale(sums - squares, change))
         weighted = tuple(jnp.where(slips, a, b) for a, b in zip(slipping, weighted, strict=True))

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -110,14 +111,16 @@ def _closest_approach(trajectory: Trajectory, point: Any, first: int, everywhere
     point = point.astype(trajectory.t1.dtype)
     log = trajectory.impacts
     begin = trajectory.t0 if first == 0 else log.time[first - 1]
-    if trajectory.motion.is_closed_form and not everywhere:
+    phase, system = None, trajectory.system
+    if trajectory.motion.is_closed_form and not everywhere and not system.may_stay:
         state = trajectory.initial if first == 0 else jax.tree.map(lambda x: x[first - 1], log.after)
         t, low, high = begin, jnp.zeros_like(begin), frozen(trajectory.t1 - begin)
     else:
         low, high, t = _bracket(frozen(trajectory), point, frozen(begin), everywhere)
         state, low, high = trajectory.at(t), low - t, high - t
-    inner = trajectory.system.unpacked(state)
-    _, pull = trajectory.system.derivative(t, inner, *trajectory.system.evolving(inner))
+        phase = _phase_at(trajectory, t) if system.may_stay else None
+    inner = system.prepared(t, system.unpacked(state, phase))
+    _, pull = system.derivative(t, inner, *system.evolving(inner))
     offset, velocity = state.position - point, state.velocity
     bend = jnp.stack([jnp.asarray(a, dtype=t.dtype) for a in pull])
     s = low + (high - low) * _samples(_ON_ONE_ARC, t.dtype)[:, None]
@@ -130,6 +133,15 @@ def _closest_approach(trajectory: Trajectory, point: Any, first: int, everywhere
     s = jnp.where(inside, s - _newton(offset, velocity, bend, s), s)
     enough = trajectory.n_impacts >= first
     return jnp.where(enough, offset + velocity * s + 0.5 * bend * s * s, jnp.nan), frozen(t + s)
+
+
+def _phase_at(trajectory: Trajectory, t: Any) -> Any:
+    """Which surface the ball is on at a time, or -1."""
+    log = trajectory.impacts
+    if log.time.shape[0] == 0:
+        return None
+    past = jnp.sum((log.surface >= 0) & (log.until <= t), dtype=jnp.int32)
+    return jnp.where(past > 0, log.support[jnp.maximum(past - 1, 0)], np.int32(-1))
 
 
 def _samples(n: int, dtype: Any) -> Any:

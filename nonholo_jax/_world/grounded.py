@@ -59,6 +59,7 @@ class Grounded(AbstractSystem):
     hits: bool = eqx.field(static=True)
     may_pass: bool = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
     is_long: ClassVar[bool] = False
+    may_stay: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -30,6 +30,7 @@ class AbstractSystem(eqx.Module):
     n_contacts: eqx.AbstractVar[int]  # a contact is its number, or a `Member`
     is_long: eqx.AbstractClassVar[bool]  # `derivative` is a long program: a loop should hold it only once
 
+    may_stay: ClassVar[bool] = False  # whether it may go on in contact: then its phase decides how it moves
     may_pass: ClassVar[bool] = False  # whether it may be handed over from one contact to another, without an impact
 
     def most_rows(self, max_impacts: int) -> int:

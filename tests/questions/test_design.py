@@ -205,3 +205,15 @@ def test_refused(name):
     options = {"free": ["spin.y"], "goal": ReturnTo(START), "t1": 2.0, **changes}
     with pytest.raises(ValueError, match=word):
         design(room(), THROW, **options)
+
+
+def test_design_follows_a_rolling_ball():
+    """design_with_rolling: the way after a train is that of the rolling ball, not a fall from the impact."""
+    scene = Scene(Ball(0.1, 1.0), {"floor": Plane((0, 0, 0), (0, 0, 1), Rough(0.0))})
+    throw = BallState([0.0, 0.0, 0.5], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    options = {"free": ["velocity.x"], "itinerary": ["floor"], "sum_trains": True, "t1": 2.0}
+    on_its_way = design(scene, throw, goal=HitTarget([1.0, 0.0, 0.1]), **options)
+    assert on_its_way.converged and float(on_its_way.miss) < 1e-12
+    np.testing.assert_allclose(on_its_way.values[0], 1.0, atol=1e-9)
+    below = design(scene, throw, goal=HitTarget([1.0, 0.0, -0.4]), **options)
+    assert not below.converged and float(below.miss) == pytest.approx(0.5, abs=1e-9)

@@ -41,7 +41,7 @@ def pieces(law, cut, turn=None, place=(0.0, 0.0, 0.0)):
     """A table top of 4 m by 2 m at the height 0, in as many pieces as `cut` says, turned as a whole."""
     rotation = (1.0, 0.0, 0.0, 0.0) if turn is None else turn
     axes = np.eye(3) if turn is None else turned_axes(jnp.asarray(turn))
-    at = lambda x: jnp.asarray(place) + jnp.asarray(x) @ axes  # noqa: E731
+    at = lambda x: jnp.asarray(place, axes.dtype) + jnp.asarray(x, axes.dtype) @ axes  # noqa: E731
     ends = np.linspace(-1.0, 3.0, cut + 1)
     middle, half = 0.5 * (ends[1:] + ends[:-1]), 0.5 * np.diff(ends)
     return {
@@ -52,9 +52,9 @@ def pieces(law, cut, turn=None, place=(0.0, 0.0, 0.0)):
 
 def rolling(speed, axes=None, place=(0.0, 0.0, 0.0), x=0.0, dtype=float, slip=0.0):
     axes = np.eye(3) if axes is None else axes
-    v = jnp.asarray([speed, 0.1 * speed, 0.0])
-    spin = jnp.asarray([-0.1 * speed, speed - slip, 0.3]) / R
-    parts = (jnp.asarray(place) + jnp.asarray([x, 0.0, R]) @ axes, v @ axes, spin @ axes)
+    array = lambda *numbers: jnp.stack([jnp.asarray(c, axes.dtype) for c in numbers])  # noqa: E731
+    v, spin = array(speed, 0.1 * speed, 0.0), array(-0.1 * speed, speed - slip, 0.3) / R
+    parts = (jnp.asarray(place, axes.dtype) + array(x, 0.0, R) @ axes, v @ axes, spin @ axes)
     return BallState(*(part.astype(dtype) for part in parts))
 
 
@@ -131,10 +131,9 @@ def turned_motions(law_name, cut, with_air, dtype):
 
     def one(turn, place, speed):
         axes = turned_axes(turn)
-        gravity = jnp.asarray([0.0, 0.0, -9.81]) @ axes
+        gravity = jnp.asarray([0.0, 0.0, -9.81], dtype) @ axes
         surfaces = pieces(law, cut, turn, place)
         scene = Scene(BALL, surfaces, gravity=gravity, air=air)
-        scene = jax.tree.map(lambda x: x.astype(dtype), scene)
         state = rolling(speed, axes, place, dtype=dtype)
         motion = Integrated(rtol=1e-11, atol=1e-11) if with_air else None
         t = simulate(scene, state, t1=jnp.asarray(1.6, dtype), motion=motion, throw=False)
