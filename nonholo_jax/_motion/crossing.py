@@ -138,7 +138,7 @@ def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, wind
             width = where(speed * left > 2.0 * reach, 2.0 * reach / where(speed > 0, speed, 1.0), left)
         width = where(jnp.isinf(window), width, jnp.minimum(left, window))
         # Where it opens from rest, at an edge that is rolled over, only a close look sees that it opens.
-        width = where(left_behind & (rate <= 0), 1e-7 * width, width)
+        width = where(left_behind & (rate <= 0), max(1e-7, float(jnp.finfo(s.dtype).eps) ** 0.5) * width, width)
     bend = system.bend(contact, arc.time, Window(coefficients, width), arc.start)
     m, most = (jnp.asarray(x, dtype=s.dtype) for x in bend)
     look, least = None, 0.0
