@@ -87,16 +87,18 @@ def reflected(
     grips: Any,
     velocity: Vector3,
     spin: Vector3,
+    levels: tuple[float, ...] | None = None,
 ) -> tuple[Vector3, Vector3]:
     """Velocity and spin after an impact on all surfaces that take part.
 
     **Arguments:** `slip_factors(closing, slip_squared)`: the factors s of all laws, as a single impact has them;
     `friction`: of the support, `None` if
-    it is infinite or zero, as `grips` says.
+    it is infinite or zero, as `grips` says; `levels`: the factors of all laws in units of what stops a slip, from the
+    largest to the smallest and without zero, if they are known and at least a hundredth apart.
     """
     y, stretch = _whitened(radius, inertia_ratio, velocity, spin)
     share = jnp.asarray(inertia_ratio / (1.0 + inertia_ratio), y.dtype)
-    set_ = _Set(*_rows(touched.normals, stretch[3]), touched, slip_factors, share)
+    set_ = _Set(*_rows(touched.normals, stretch[3]), touched, slip_factors, share, levels)
     grips = jnp.asarray(grips).astype(y.dtype)
     if friction is None:
         after = _within(set_, y, grips)[0]
@@ -124,6 +126,7 @@ class _Set(NamedTuple):
     touched: Touched
     slip_factors: Callable
     share: Any
+    levels: tuple | None
 
 
 def _whitened(radius: Number, inertia_ratio: Number, velocity: Vector3, spin: Vector3) -> tuple[Any, Any]:
@@ -193,17 +196,21 @@ def _kicks(set_: _Set, rows: Any, load: Any, sliding: Any) -> Any:
 
     own = factors(matmul(rows, sliding))
     own = jnp.where(set_.touched.takes_part & ~set_.touched.is_support, own, 0.0)
-    order = jnp.argsort(-lax.stop_gradient(own))
-    levels = own[order]
+    if set_.levels is None:
+        order = jnp.argsort(-lax.stop_gradient(own))
+        levels, places = own[order], np.arange(own.size)[:, None]
+        ranks = jnp.argmax(order[None] == places, axis=1)  # so many are abler
+        able = (ranks[None] <= places) & (own > 0)[None]
+    else:
+        levels = jnp.asarray(set_.levels, own.dtype)
+        able = own[None] > (1.0 - 1e-3) * levels[:, None]
 
-    def shared_by(first: Any) -> Any:
-        """By so many of the ablest."""
-        able = jnp.any((order[None] == np.arange(own.size)[:, None]) & first[None], axis=1) & (own > 0)
+    def shared_by(able: Any) -> Any:
         part = jnp.where(able[:, None, None], rows, 0.0).reshape(-1, sliding.size)
         return matmul(_pseudo_inverse(part).T, sliding).reshape(-1, 2)
 
     steps = levels - jnp.concatenate([levels[1:], jnp.zeros_like(levels[:1])])
-    kicks = jnp.sum(steps[:, None, None] * jax.vmap(shared_by)(np.tri(own.size, dtype=bool)), axis=0)
+    kicks = jnp.sum(steps[:, None, None] * jax.vmap(shared_by)(able), axis=0)
     gripping = factors(jnp.zeros_like(kicks))[:, None]
     grips = gripping > 0
     stops = kicks / jnp.where(grips, gripping, 1.0)

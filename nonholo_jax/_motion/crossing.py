@@ -118,8 +118,8 @@ def _return(system: AbstractSystem, contact: Any, arc: Arc) -> Return | None:
     """When a parabola that begins on a flat face comes back to it."""
     if any(len(p) > 3 for p in arc.configuration):
         return None
-    parts = [tuple(p[k] if len(p) > k else 0.0 for p in arc.configuration) for k in range(3)]
-    return system.returns(contact, arc.time, *parts, arc.start)
+    q, v, half_a = (tuple(p[k] if len(p) > k else 0.0 for p in arc.configuration) for k in range(3))
+    return system.returns(contact, arc.time, q, v, half_a, arc.start)
 
 
 def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, window: Any, touching: Any) -> _Step:

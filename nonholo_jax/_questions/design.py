@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._math import LEAST_EFFORT, RESULTS, along, is_failure, on_cpu, result_name, surfaces_hit
+from .._math import KINDS, LEAST_EFFORT, RESULTS, along, is_failure, on_cpu, result_name, surfaces_hit
 from .._motion import Trajectory, checked, simulate
 from .._world import BallState, Scene
 from .chart import Chart, chart_of, limits_of

@@ -186,7 +186,7 @@ class AbstractBlock(AbstractSurface):
         rise, pull = (where(backwards, times(-1.0, c), c) for c in (pick(w), times(-1.0, pick(b))))
         # Not of a ball that has just rolled over an edge, whose place is known to rounding only.
         eps = float(jnp.finfo(jnp.result_type(*[c for c in y if not is_constant(c)])).eps)
-        inner = tuple(plus(h, times(-64.0 * eps, plus(h, self.extent()))) for h in half)
+        inner: Any = tuple(plus(h, times(-64.0 * eps, plus(h, self.extent()))) for h in half)
         comes = (pull > 0) & (rise > 0) & _is_over(y, inner, pick)
         duration = where(comes, rise / where(comes, pull, 1.0), 0.0)
         landing = tuple(plus(c, times(duration, plus(u, times(duration, d)))) for c, u, d in zip(y, w, b, strict=True))

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._impact import Touched, reflected, takes_part
+from .._impact import Rough, Smooth, Touched, reflected, takes_part
 from .._math import Number, Vector3, dot, frozen, is_constant, plus, scale, subtract, times
 from .surface import AbstractSurface
 from .system import magnitude, rounding
@@ -199,13 +199,26 @@ def after_all(scene: Any, time: Any, struck: Any, state: Any, support: Support |
 
     friction, rolls = (None, 0.0) if support is None else (support.friction, support.rolls)
     sizes = scene.ball.radius, scene.ball.inertia_ratio
-    after = reflected(*sizes, touched, factors, friction, rolls, state.velocity, state.spin)
+    after = reflected(*sizes, touched, factors, friction, rolls, state.velocity, state.spin, _levels(scene))
     return ~only | stays, after, stays
 
 
 def numbers_of(scene: Any) -> Any:
     """The number of every surface."""
     return jnp.arange(scene.n_contacts, dtype=jnp.int32)
+
+
+def _levels(scene: Any) -> tuple[float, ...] | None:
+    """By how much the laws of a scene multiply what stops a slip, from the largest to the smallest and without zero, if
+    that is known when it is traced."""
+    laws = [each.first.law if isinstance(each, Stack) else each.law for each in scene.surfaces]
+    reversals = [law.reversal() for law in laws]
+    known = all(type(law) in (Rough, Smooth) and is_constant(e) for law, e in zip(laws, reversals, strict=True))
+    if not known:
+        return None
+    found = sorted({1.0 + float(e) for e in reversals if e > -1}, reverse=True)  # pyright: ignore
+    apart = all(b < 0.99 * a for a, b in itertools.pairwise(found))
+    return tuple(found) if apart and found else None
 
 
 def _spread(x: Any, pick: Callable, count: int) -> Any:
@@ -251,7 +264,7 @@ def _are_spare(scene: Any, time: Any, x: Any, here: _Here, touched: Any, held: A
     flush faces have them where they meet, and faces with one normal."""
     radius = scene.ball.radius
     place = jnp.stack([jnp.asarray(c, time.dtype) for c in x])
-    points = place[None] - plus(radius, here.gap)[:, None] * here.normal
+    points = place[None] - (radius + here.gap)[:, None] * here.normal
     far = lambda each: jax.vmap(lambda p: jnp.asarray(each.surface.distance(tuple(p), time), time.dtype))(points)  # noqa: E731
     lies_on = pick(abs(_every(scene, far))) <= 2.0 * here.noise[:, None]  # of the point of the second on the first
     apart = jnp.max(abs(here.normal[:, None] - here.normal[None]), axis=-1)

@@ -240,6 +240,16 @@ def test_laws_go_over_into_each_other():
         np.testing.assert_allclose(of(Frictional(0.8, 0.3, 1e9)), of(Rough(0.8, 0.3)), rtol=0, atol=1e-11)
 
 
+def test_levels_that_are_known_are_those_that_are_found():
+    """The shorter program for laws without friction whose numbers are constants."""
+    rng = np.random.default_rng(9)
+    laws = [Rough(0.6), Rough(0.9, 0.2), Smooth(0.7), Rough(0.5, 0.2)]
+    touched, (v, spin) = touched_by(laws, random_normals(rng, 4)), state_of(rng)
+    options = (R, ALPHA, touched, factors_of(laws), None, 0.0, tuple(v), tuple(spin))
+    known = reflected(*options, levels=(1.6, 1.2))
+    np.testing.assert_allclose(np.concatenate(known), np.concatenate(reflected(*options)), rtol=0, atol=1e-12)
+
+
 def test_dropped_into_a_valley_it_comes_straight_back():
     c = np.sqrt(0.5)
     for law in (Rough(0.5), Rough(0.5, -0.3), Rough(0.5, 0.9), Smooth(0.5), Frictional(0.5, 0.2, 0.4)):
