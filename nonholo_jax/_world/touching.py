@@ -86,11 +86,10 @@ def may_touch_two(surfaces: Sequence[AbstractSurface | Stack], radius: Number) -
 
 def are_apart(a: AbstractSurface, b: AbstractSurface, radius: Number) -> bool:
     """Whether two surfaces are known to lie on two sides of a slab that is thicker than the ball."""
-    if not is_constant(radius):
+    shapes = [value for each in (a, b) for name, value in vars(each).items() if name != "law"]
+    if not all(is_constant(x) for x in (radius, *jax.tree.leaves(shapes))):
         return False
     for n in (*a.directions(), *b.directions(), *_AXES):
-        if not all(is_constant(c) for c in n):
-            continue
         for one, other in ((a, b), (b, a)):
             ends = one.most(n), other.most(scale(-1.0, n))
             if all(is_constant(end) for end in ends) and -(ends[0] + ends[1]) > 2.0 * radius:  # pyright: ignore
@@ -98,13 +97,18 @@ def are_apart(a: AbstractSurface, b: AbstractSurface, radius: Number) -> bool:
     return False
 
 
-def may_be_flush(surfaces: Sequence[AbstractSurface], radius: Number) -> bool:
+def may_be_flush(surfaces: Sequence[AbstractSurface], radius: Any) -> bool:
     """Whether two surfaces may have faces in one plane, as far as is known when it is traced."""
     flat = [each for each in surfaces if type(each).along is not AbstractSurface.along]
+    if not is_constant(radius):  # perhaps one for each of many scenes
+        return len(flat) > 1
     return any(_share_a_plane(a, b) and not are_apart(a, b, radius) for a, b in itertools.combinations(flat, 2))
 
 
 def _share_a_plane(a: AbstractSurface, b: AbstractSurface) -> bool:
+    shapes = [value for each in (a, b) for name, value in vars(each).items() if name != "law"]
+    if not all(is_constant(leaf) for leaf in jax.tree.leaves(shapes)):
+        return True
     pairs = itertools.product(a.planes(), b.planes())
     for (n, one), (m, other) in pairs:
         differences = (*subtract(n, m), plus(one, times(-1.0, other)))
