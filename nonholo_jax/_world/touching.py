@@ -240,10 +240,11 @@ def _nearby(scene: Any, time: Any, struck: Any, state: Any, support: Support | N
     touched = (abs(here.gap) <= 16.0 * here.noise) | (numbers == struck) | held
     pick: Callable = lambda values: values  # noqa: E731
     if count > _MOST:
-        few = jnp.nonzero(touched, size=_MOST, fill_value=count - 1)[0]
+        # The one that is hit and the support before the others.
+        wanted = touched.astype(jnp.int32) + ((numbers == struck) | held).astype(jnp.int32)
+        _, few = jax.lax.top_k(frozen(wanted), _MOST)
         pick = lambda values: values[few]  # noqa: E731
-        is_first = jnp.arange(_MOST, dtype=jnp.int32) < jnp.sum(touched, dtype=jnp.int32)
-        touched, held, here = is_first, pick(held) & is_first, jax.tree.map(pick, here)
+        touched, held, here = pick(touched), pick(held), jax.tree.map(pick, here)
     spare = frozen(_are_spare(scene, time, x, here, touched, held, pick))
     law = lambda each: jnp.asarray(each.surface.law.restitution, time.dtype)  # noqa: E731
     restitution = pick(_every(scene, law))

@@ -263,6 +263,21 @@ def test_rolling_into_a_square_corner(cloth, rail):
         )
 
 
+@pytest.mark.parametrize("last", [True, False])
+def test_a_corner_among_many_surfaces(last):
+    """More surfaces than are looked at: what is not touched changes nothing, wherever it stands in the scene."""
+    law = Frictional(0.7, 0.2, 0.3)
+    corner = {"floor": Plane((0, 0, 0), (0, 0, 1), law), "x": Plane((1, 0, 0), (-1, 0, 0), law)}
+    others = {f"far_{i}": Box((-5.0 - i, 0, 0), (0.3, 0.3, 0.3), law) for i in range(9)}
+    state = BallState([1 - R - 0.3, 0.0, R + 0.3], [1.0, 0.2, -1.0], [3.0, 20.0, 1.0])
+    few = simulate(Scene(BALL, corner, gravity=(0, 0, 0)), state, t1=0.5)
+    surfaces = {**others, **corner} if last else {**corner, **others}
+    many = simulate(Scene(BALL, surfaces, gravity=(0, 0, 0)), state, t1=0.5)
+    assert int(few.n_impacts) == int(many.n_impacts) == 1
+    np.testing.assert_allclose(many.final.velocity, few.final.velocity, atol=1e-13)
+    np.testing.assert_allclose(many.final.spin, few.final.spin, atol=1e-12)
+
+
 @pytest.mark.parametrize("place", ["nose", "wall"])
 def test_the_same_cushion_by_four_laws(place):
     """s10b: no friction is smooth, and so is e_t = -1."""
