@@ -6,8 +6,8 @@ projection). The surfaces that it loads take part; and the support of a ball tha
 What. In the coordinates y = (v, sqrt(alpha) r omega), in which the metric is the identity, let P_n project on the
 normals of the set and P on all that its contact points may not do. If all have one law, y+ = y - (1 + e_n) P_n y -
 (1 + e_t) (P - P_n) y, which is (4.2) for e_n = e_t. If not, every normal velocity is reversed by its own e_n, and the
-impulse that stops all slips, the shortest one, is multiplied surface by surface by what that one's law says. A support
-is the paper's A: all of this happens within its kernel, and it takes what it has to, up to its friction.
+shortest impulse that stops all slips goes to each surface as far as its law goes (`_kicks`). A support is A of the paper:
+all of this happens within its kernel, and it takes what it has to, up to its friction.
 """
 
 import itertools
@@ -91,10 +91,10 @@ def reflected(
 ) -> tuple[Vector3, Vector3]:
     """Velocity and spin after an impact on all surfaces that take part.
 
-    **Arguments:** `slip_factors(closing, slip_squared)`: the factors s of all laws, as a single impact has them;
-    `friction`: of the support, `None` if
-    it is infinite or zero, as `grips` says; `levels`: the factors of all laws in units of what stops a slip, from the
-    largest to the smallest and without zero, if they are known and at least a hundredth apart.
+    **Arguments:** `slip_factors(closing, slip_squared)` gives the factors s of all laws, as a single impact has them;
+    `friction` is that of the support, or `None` where `grips` says all: it holds the ball (1) or is smooth (0);
+    `levels` are the factors of all laws in units of what stops a slip, from the largest to the smallest and without
+    zero, if they are known and at least a hundredth apart.
     """
     y, stretch = _whitened(radius, inertia_ratio, velocity, spin)
     share = jnp.asarray(inertia_ratio / (1.0 + inertia_ratio), y.dtype)

@@ -162,11 +162,6 @@ class AbstractBlock(AbstractSurface):
         sides = [(tuple(pick(column) for column in zip(*others[i], strict=True)), pick(others[i + 2])) for i in (0, 1)]
         return center, sides
 
-    def planes(self):
-        center, half, axes = self._frame()
-        signed = [(scale(s, axes[i]), half[i]) for i in self.faces for s in (1.0, -1.0)]
-        return [(n, plus(dot(n, center), h)) for n, h in signed]
-
     def directions(self):
         axes = self._frame()[2]
         return (*axes, *[scale(-1.0, axis) for axis in axes])

@@ -131,12 +131,8 @@ class AbstractSurface(eqx.Module):
         del n
         return None
 
-    def planes(self) -> Sequence[tuple[Vector3, Number]]:
-        """Normal n of every face, and n . x on it."""
-        return ()
-
     def directions(self) -> Sequence[Vector3]:
-        """Directions along which this surface may be apart from others."""
+        """Directions along which this surface may be apart from others, with the normals of its faces among them."""
         return ()
 
     def most(self, n: Vector3) -> Number | None:
@@ -227,10 +223,6 @@ class Plane(AbstractSurface):
 
     def along(self, n, x, v, slack):
         return Along(self.direction(x, 0.0), self.distance(x, 0.0), True, -jnp.inf)
-
-    def planes(self):
-        n = unit(components(self.facing))
-        return ((n, dot(n, components(self.point))),)
 
     def directions(self):
         return (unit(components(self.facing)),)

@@ -15,6 +15,7 @@ from .._math import Number, Vector3, dot, frozen, is_constant, plus, scale, subt
 from .surface import AbstractSurface
 from .system import magnitude, rounding
 
+_TOUCHING = 16.0  # by how many roundings of it a gap may differ from zero
 _MOST = 8  # surfaces of those touched that are looked at, if a scene has more
 _FEW = 16  # surfaces of which all pairs are looked at before there is a program
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -86,8 +87,7 @@ def may_touch_two(surfaces: Sequence[AbstractSurface | Stack], radius: Number) -
 
 def are_apart(a: AbstractSurface, b: AbstractSurface, radius: Number) -> bool:
     """Whether two surfaces are known to lie on two sides of a slab that is thicker than the ball."""
-    shapes = [value for each in (a, b) for name, value in vars(each).items() if name != "law"]
-    if not all(is_constant(x) for x in (radius, *jax.tree.leaves(shapes))):
+    if not (is_constant(radius) and _is_known(a, b)):
         return False
     for n in (*a.directions(), *b.directions(), *_AXES):
         for one, other in ((a, b), (b, a)):
@@ -106,18 +106,20 @@ def may_be_flush(surfaces: Sequence[AbstractSurface], radius: Any) -> bool:
 
 
 def _share_a_plane(a: AbstractSurface, b: AbstractSurface) -> bool:
-    shapes = [value for each in (a, b) for name, value in vars(each).items() if name != "law"]
-    if not all(is_constant(leaf) for leaf in jax.tree.leaves(shapes)):
+    if not _is_known(a, b):
         return True
-    pairs = itertools.product(a.planes(), b.planes())
-    for (n, one), (m, other) in pairs:
-        differences = (*subtract(n, m), plus(one, times(-1.0, other)))
-        sizes = (a.extent(), b.extent())
-        if not all(is_constant(x) for x in (*differences, *sizes)):
-            return True
-        if max(abs(x) for x in differences[:3]) < 1e-3 and abs(differences[3]) <= 1e-3 * (sizes[0] + sizes[1]):
+    for n, m in itertools.product(a.directions(), b.directions()):
+        turned = max(abs(x) for x in subtract(n, m))
+        apart, size = plus(a.most(n), times(-1.0, b.most(m))), plus(a.extent(), b.extent())  # pyright: ignore
+        if turned < 1e-3 and abs(apart) <= 1e-3 * size:
             return True
     return False
+
+
+def _is_known(*surfaces: AbstractSurface) -> bool:
+    """Whether places and sizes are numbers of Python."""
+    shapes = [value for each in surfaces for name, value in vars(each).items() if name != "law"]
+    return all(is_constant(leaf) for leaf in jax.tree.leaves(shapes))
 
 
 class Support(NamedTuple):
@@ -149,7 +151,7 @@ def _every(scene: Any, function: Callable[[Member], Any]) -> Any:
 def touches(scene: Any, member: Member, time: Any, position: Vector3) -> Any:
     """Whether a ball touches a surface, to rounding."""
     noise = rounding(scene, member, magnitude(position), time.dtype)
-    return abs(scene.level(member, time, position, None)) <= 16.0 * noise
+    return abs(scene.level(member, time, position, None)) <= _TOUCHING * noise
 
 
 def touches_two(scene: Any, time: Any, position: Vector3) -> Any:
@@ -171,11 +173,11 @@ def neighbours(scene: Any, time: Any, normal: Vector3, height: Any, state: Any) 
 
     def of(each: Member) -> Neighbours:
         noise = rounding(scene, each, magnitude(x), time.dtype)
-        face = each.surface.along(normal, x, state.velocity, 16.0 * noise)
+        face = each.surface.along(normal, x, state.velocity, _TOUCHING * noise)
         if face is None:
             return Neighbours(jnp.asarray(False), jnp.asarray(False), jnp.asarray(-jnp.inf, time.dtype))
         turned = jnp.max(jnp.stack([jnp.asarray(abs(c), time.dtype) for c in subtract(face.normal, normal)]))
-        flush = (turned <= 2.0 * noise / radius) & (abs(face.height - height) <= 16.0 * noise)
+        flush = (turned <= 2.0 * noise / radius) & (abs(face.height - height) <= _TOUCHING * noise)
         return Neighbours(flush, jnp.asarray(face.holds), jnp.asarray(face.ahead, time.dtype))
 
     return frozen(_every(scene, of))
@@ -237,7 +239,7 @@ def _nearby(scene: Any, time: Any, struck: Any, state: Any, support: Support | N
     here = _every(scene, lambda each: _seen(scene, each, time, state))
     numbers = numbers_of(scene)
     held = jnp.zeros((count,), bool) if support is None else numbers == support.index
-    touched = (abs(here.gap) <= 16.0 * here.noise) | (numbers == struck) | held
+    touched = (abs(here.gap) <= _TOUCHING * here.noise) | (numbers == struck) | held
     pick: Callable = lambda values: values  # noqa: E731
     if count > _MOST:
         # The one that is hit and the support before the others.
