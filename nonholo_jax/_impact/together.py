@@ -6,8 +6,8 @@ projection). The surfaces that it loads take part; and the support of a ball tha
 What. In the coordinates y = (v, sqrt(alpha) r omega), in which the metric is the identity, let P_n project on the
 normals of the set and P on all that its contact points may not do. If all have one law, y+ = y - (1 + e_n) P_n y -
 (1 + e_t) (P - P_n) y, which is (4.2) for e_n = e_t. If not, every normal velocity is reversed by its own e_n, and the
-shortest impulse that stops all slips goes to each surface as far as its law goes (`_kicks`). A support is A of the paper:
-all of this happens within its kernel, and it takes what it has to, up to its friction.
+shortest impulse that stops all slips goes to each surface as far as its law goes (`_kicks`). A support is the paper's
+A: all of this happens within its kernel, and it takes what it has to, up to its friction.
 """
 
 import itertools
