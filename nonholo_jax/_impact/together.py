@@ -167,11 +167,10 @@ def _within(set_: _Set, y: Any, grip: Any) -> tuple[Any, Any, Any]:
     push = matmul(inverse, (1.0 + touched.restitution) * closing)
     scale = _at_most_elastic(begin, push)
     load = -scale * matmul(inverse.T, push)
-    sliding = begin - matmul(inverse, closing)
 
     rows = free(jnp.where(others[:, :, None], set_.tangents, 0.0).reshape(-1, 6))
     rows = (rows - matmul(matmul(rows, inverse), normal)).reshape(-1, 2, 6)
-    kick = _kicks(set_, rows, load, sliding)
+    kick = _kicks(set_, rows, load, begin)
     drag = jnp.sum(rows * kick[:, :, None], axis=(0, 1))
     after = begin - scale * push
     slower = _at_most_elastic(after, drag)
@@ -183,7 +182,7 @@ def _within(set_: _Set, y: Any, grip: Any) -> tuple[Any, Any, Any]:
     return after, presses, root(_above_rounding(matmul(keeps, keeps), y))
 
 
-def _kicks(set_: _Set, rows: Any, load: Any, sliding: Any) -> Any:
+def _kicks(set_: _Set, rows: Any, load: Any, y: Any) -> Any:
     """What every surface takes of the slip, shape (K, 2). Where all laws have one factor w, it is w times the shortest
     impulse that stops all of the slip. Where not, as far as to the least w all take part in that, from there to the
     next one those that reach so far, and so on: continuous in all numbers, and a smooth surface, w = 0, is not there.
@@ -191,10 +190,10 @@ def _kicks(set_: _Set, rows: Any, load: Any, sliding: Any) -> Any:
     closing = jnp.maximum(load, 0.0) / (1.0 + set_.touched.restitution)
 
     def factors(stops: Any) -> Any:
-        squared = _above_rounding(jnp.sum(stops * stops, axis=1), sliding) / set_.share
+        squared = _above_rounding(jnp.sum(stops * stops, axis=1), y) / set_.share
         return set_.slip_factors(closing, squared) / set_.share
 
-    own = factors(matmul(rows, sliding))
+    own = factors(matmul(rows, y))
     own = jnp.where(set_.touched.takes_part & ~set_.touched.is_support, own, 0.0)
     if set_.levels is None:
         order = jnp.argsort(-lax.stop_gradient(own))
@@ -206,8 +205,8 @@ def _kicks(set_: _Set, rows: Any, load: Any, sliding: Any) -> Any:
         able = own[None] > (1.0 - 1e-3) * levels[:, None]
 
     def shared_by(able: Any) -> Any:
-        part = jnp.where(able[:, None, None], rows, 0.0).reshape(-1, sliding.size)
-        return matmul(_pseudo_inverse(part).T, sliding).reshape(-1, 2)
+        part = jnp.where(able[:, None, None], rows, 0.0).reshape(-1, y.size)
+        return matmul(_pseudo_inverse(part).T, y).reshape(-1, 2)
 
     steps = levels - jnp.concatenate([levels[1:], jnp.zeros_like(levels[:1])])
     kicks = jnp.sum(steps[:, None, None] * jax.vmap(shared_by)(able), axis=0)
