@@ -155,6 +155,7 @@ class Touch(NamedTuple):
     slips: Any  # whether all impacts of the train slip
     grips: Any  # whether all of them grip
     on: Any  # whether the ball was on a face before, and is not thrown off it
+    onto: Any  # the surface onto which it passes, or -1; `None` where no faces are flush
 
 
 class Settling(NamedTuple):
@@ -200,15 +201,14 @@ class Settling(NamedTuple):
         other = (_numbers(self.scene) != phase_of(state)) & (state.support >= 0)
         return found._replace(flush=found.flush & other)
 
-    def _onto(self, touch: Touch) -> Any:
-        """The surface onto which a ball passes that comes to an edge of its support, or onto a flush face; or -1."""
-        found = self._flush(touch.time, touch.state, touch.face.normal)
-        index, least = touch.contact.index, float(jnp.finfo(touch.time.dtype).min)
-        reached = found.flush & (found.holds | (_numbers(self.scene) == index))
+    def _onto(self, index: Any, found: Neighbours, time: Any) -> Any:
+        """The surface onto which a ball passes that comes to the contact of that index, an edge of its support or a
+        flush face; or -1."""
+        is_met = found.flush & (_numbers(self.scene) == index)
+        reached, least = found.flush & found.holds | is_met, float(jnp.finfo(time.dtype).min)
         best = jnp.argmax(jnp.where(reached, jnp.maximum(found.ahead, least), -jnp.inf)).astype(jnp.int32)
         over = (index >= self.scene.n_contacts) & (index != self.end_of_slip)
-        comes = over | jnp.any(found.flush & (_numbers(self.scene) == index))
-        return where(comes & jnp.any(reached), best, np.int32(-1))
+        return where((over | jnp.any(is_met)) & jnp.any(reached), best, np.int32(-1))
 
     def pull(self, time: Any, flight: Flight) -> Vector3:
         """Gravity, and what air gives now."""
@@ -226,16 +226,17 @@ class Settling(NamedTuple):
     ) -> Touch:
         """`stays` says whether a ball that was on a face before an impact is there afterwards."""
         floors, on = self.floors, (state.support >= 0) & (stays | (contact.index >= self.scene.n_contacts))
+        onto = None
         if self.joins:  # on a face that is flush with its support it is no less on that
             face, _ = floors.face(self.scene.choice(phase_of(state)), state.flight.position, time)
-            flush = self._flush(time, state, face.normal).flush
-            on = on | jnp.any(flush & (_numbers(self.scene) == contact.index))
+            onto = self._onto(contact.index, self._flush(time, state, face.normal), time)
+            on = on | (onto >= 0)
         floor = self.scene.choice(where(on, phase_of(state), contact.index))
         face, edged = floors.face(floor, state.flight.position, time)
         first = train.start(struck.velocity, struck.spin, face.normal, pull, self.scene.ball.radius)
         law = floors.law(floor)
         slips, grips = self._regime(first, law)
-        return Touch(contact, time, state, n, struck, pull, floor, face, edged, first, law, slips, grips, on)
+        return Touch(contact, time, state, n, struck, pull, floor, face, edged, first, law, slips, grips, on, onto)
 
     def _regime(self, first: train.Start, law: train.Contact) -> tuple[Any, Any]:
         """Whether all impacts of a train slip, and whether all of them grip."""
@@ -307,7 +308,7 @@ class Settling(NamedTuple):
         bounce_or_end = KINDS.where(dies_out & clear, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
         over = KINDS.where(grips, KINDS.gripped, KINDS.left)
         kind = KINDS.where(on, KINDS.where(is_exit, over, KINDS.rolling), bounce_or_end)
-        passes = on & (self._onto(touch) >= 0) if self.joins else False
+        passes = touch.onto >= 0 if self.joins else False
         kind = KINDS.where(passes, KINDS.passed, kind) if self.joins else kind
 
         end = train.summed(*self.train_of(touch, kind))
@@ -360,7 +361,7 @@ class Settling(NamedTuple):
         surface = touch.contact.index.astype(jnp.asarray(touch.state.support).dtype)
         support = where(settles, surface, where(stays, touch.state.support, -1.0))
         if self.joins:
-            passed, onto = kind == KINDS.passed, self._onto(touch)
+            passed, onto = kind == KINDS.passed, touch.onto
             support = where(passed, onto.astype(support.dtype), support)
             after = self._passed(passed, onto, touch, after)
         at_rest = (settles | stays) & self._is_still(touch, after, held)
