@@ -184,7 +184,7 @@ def program(template: Template) -> Callable:
         end = simulate(scene, state, t1=2.0, max_impacts=ROWS, throw=False)
         log = end.impacts
         moving = [(s.position, s.velocity, s.spin) for s in (log.before, log.after, end.final)]
-        return end.result._value, end.n_impacts, end.t1, log.time, log.until, *moving  # pyright: ignore
+        return end.result._value, end.n_rows, end.t1, log.time, log.until, *moving  # pyright: ignore
 
     return jax.jit(jax.vmap(one), compiler_options=OPTIONS)
 
@@ -207,7 +207,8 @@ def judged(template: Template, d: dict[str, np.ndarray], dtype: Any) -> Found:
     cast = lambda x: np.asarray(x, dtype=float if jnp.issubdtype(x.dtype, jnp.floating) else None)  # noqa: E731
     codes, counts, t1, time, until, before, after, final = jax.tree.map(cast, out)
     start = (d["position"], d["velocity"], d["spin"])
-    used = np.arange(ROWS)[None] < counts[:, None]
+    rows = time.shape[1]  # as many as impacts and faces passed at most
+    used = np.arange(rows)[None] < counts[:, None]
     # Arcs from each `after` to the next `before`, the last one to the final state; unused ones stand still there.
     begin = [np.concatenate([s[:, None], np.where(used[..., None], a, f[:, None])], axis=1)
              for s, a, f in zip(start, after, final, strict=True)]  # fmt: skip
@@ -219,7 +220,7 @@ def judged(template: Template, d: dict[str, np.ndarray], dtype: Any) -> Found:
     fine = np.isin(named, OK)
     finite = np.all([np.isfinite(x).all(axis=-1) for x in final], axis=0) & np.isfinite(t1)
     x = sampled(begin, end, ends - begins)
-    gap = gaps(template, d, x.reshape(n, -1, 3)).reshape(n, ROWS + 1, SAMPLES)
+    gap = gaps(template, d, x.reshape(n, -1, 3)).reshape(n, rows + 1, SAMPLES)
     # Places are known to roundings of the coordinates that they are computed from, and of the way there.
     reach = np.abs(x).max(axis=(1, 2, 3)) + 4.0
     depth = np.max(-gap, axis=(1, 2)) / (16.0 * eps * reach)
