@@ -38,10 +38,9 @@ ROOMS = {
         "touching",
         "checks",
         "scene",
-        "settling",
-        "grounded",
         "lagrangian",
     ],
+    "_staying": ["floors", "ground", "settling", "grounded"],
     "_motion": ["crossing", "motion", "integrated", "loop", "hopping", "replay", "accuracy", "trajectory", "simulate"],
     "_questions": [
         "diagnostics",

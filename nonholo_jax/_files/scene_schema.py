@@ -44,6 +44,8 @@ class RoughTable(Table):
     kind: Literal["rough"]
     restitution: Restitution = 1.0
     tangential: Tangential | None = None
+    rolling: NotNegative = 0.0
+    spinning: NotNegative = 0.0
 
 
 class SmoothTable(Table):
@@ -56,6 +58,8 @@ class FrictionalTable(Table):
     restitution: Restitution
     tangential: Tangential
     friction: NotNegative
+    rolling: NotNegative = 0.0
+    spinning: NotNegative = 0.0
 
 
 LawTable = Annotated[RoughTable | SmoothTable | FrictionalTable, Field(discriminator="kind")]
@@ -200,6 +204,8 @@ _EXAMPLES = {
     "restitution": "restitution = 0.9 (1 conserves energy, 0 is plastic)",
     "tangential": "tangential = 0.5 (1 reverses the slip, -1 keeps it)",
     "friction": "friction = 0.6 (0 is a smooth wall)",
+    "rolling": "rolling = 0.056 (0 rolls on for ever)",
+    "spinning": "spinning = 0.02 (0 spins on for ever)",
     "density": "density = 1.204 (kg/m^3)",
     "drag": "drag = 0.47 (a smooth sphere)",
     "lift": "lift = 1.0",

@@ -10,7 +10,7 @@ from .._world import Scene
 _ALONG_AXES = ("gravity", "facing", "axis", "tangent", "rotation")
 _STRUCTURE = {
     **dict.fromkeys((*_ALONG_AXES, "restitution", "tangential"), (-1.0, 0.0, 1.0)),
-    **dict.fromkeys(("friction", "density", "drag", "lift", "wind"), (0.0,)),
+    **dict.fromkeys(("friction", "rolling", "spinning", "density", "drag", "lift", "wind"), (0.0,)),
 }
 
 
@@ -21,8 +21,8 @@ def traced(scene: Scene, dtype: Any = None) -> Scene:
 
     Returns the same scene. What changes the model stays a number of Python, and with it a constant of the program:
     restitution and tangential that are exactly -1, 0 or 1; components of gravity, normals, axes, tangents and rotations
-    that are; friction, density, drag, lift and components of the wind that are exactly 0. All else becomes a scalar, of
-    vectors component by component, which is the smaller program.
+    that are; friction, resistance, density, drag, lift and components of the wind that are exactly 0. All else becomes
+    a scalar, of vectors component by component, which is the smaller program.
 
     ```python
     from nonholo_jax import Ball, BallState, Plane, Rough, Scene, simulate

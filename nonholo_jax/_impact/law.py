@@ -24,6 +24,10 @@ class AbstractContactLaw(eqx.Module):
         """The share e_t of its slip that an impact reverses if it grips; `None` where there is no such number."""
         return None
 
+    def resistance(self) -> tuple[Number, Number]:
+        """The coefficients of rolling resistance and of spinning friction of a ball that stays on the surface."""
+        return 0.0, 0.0
+
     def sliding_friction(self) -> Number | None:
         """The coefficient f of a ball that slides on the surface after its last bounce; `None` where it cannot."""
         return None
@@ -53,6 +57,11 @@ def _grip(inertia_ratio: Number) -> Number:
     return inertia_ratio / (1 + inertia_ratio)
 
 
+def _resists(law: "Rough | Frictional") -> list:
+    found = (("rolling", law.rolling), ("spinning", law.spinning))
+    return [(value >= 0, f"`{name}` must not be negative, but got {value}; 0 is without loss") for name, value in found]
+
+
 def _within(name: str, value: Number, low: float, high: float, remedy: str):
     return ((value >= low) & (value <= high), f"`{name}` must lie in [{low:g}, {high:g}], but got {value}; {remedy}")
 
@@ -65,6 +74,10 @@ class Rough(AbstractContactLaw):
     - `restitution`: e_n in [0, 1], normal coefficient. 1 conserves energy, 0 is plastic.
     - `tangential`: e_t in [-1, 1], the share of the slip that is reversed. `None` means the paper's law, in which one
         coefficient mu multiplies the normal and the tangential part alike. -1 leaves the slip untouched.
+    - `rolling`: coefficient c >= 0 of rolling resistance. A ball that rolls, pressed on with the force N, has a torque
+        c (1 + alpha) N r against its rolling, so that on the level it slows down by c g and stops.
+    - `spinning`: coefficient c >= 0 of spinning friction, for a ball that stays on the surface: a torque c N r against
+        the spin about the normal, which on the level loses c g / (alpha r) a second.
 
     Raises `ValueError` for a coefficient out of range. Source: the paper, Theorem 5.2 and (6.1); for two coefficients
     Garwin, Am. J. Phys. 37, 88 (1969) and Cross, Am. J. Phys. 70, 1093 (2002).
@@ -77,6 +90,8 @@ class Rough(AbstractContactLaw):
 
     restitution: Number = eqx.field(converter=as_number, default=1.0)
     tangential: Number | None = eqx.field(converter=as_number, default=None)
+    rolling: Number = eqx.field(converter=as_number, default=0.0)
+    spinning: Number = eqx.field(converter=as_number, default=0.0)
     rolls: ClassVar[bool | None] = True
 
     def __check_init__(self):
@@ -89,7 +104,10 @@ class Rough(AbstractContactLaw):
         checks = super().admissible()
         if self.tangential is not None:
             checks.append(_within("tangential", self.tangential, -1.0, 1.0, "1 reverses the slip, -1 keeps it"))
-        return checks
+        return [*checks, *_resists(self)]
+
+    def resistance(self) -> tuple[Number, Number]:
+        return self.rolling, self.spinning
 
     def slip_factor(self, inertia_ratio: Number, closing_speed: Number, slip_squared: Number) -> Number:
         return times(1 + self.reversal(), _grip(inertia_ratio))
@@ -129,6 +147,7 @@ class Frictional(AbstractContactLaw):
     - `restitution`: e_n in [0, 1].
     - `tangential`: e_t in [-1, 1] of the gripping contact.
     - `friction`: Coulomb coefficient f >= 0.
+    - `rolling`, `spinning`: as in `Rough`, of a ball that stays on the surface; while it slips, `rolling` does nothing.
 
     Raises `ValueError` out of range. Source: Walton's three-parameter law, as in Foerster et al., Phys. Fluids 6,
     1108 (1994). After the last bounce the ball slides, with the same coefficient, until it rolls.
@@ -142,6 +161,8 @@ class Frictional(AbstractContactLaw):
     restitution: Number = eqx.field(converter=as_number)
     tangential: Number = eqx.field(converter=as_number)
     friction: Number = eqx.field(converter=as_number)
+    rolling: Number = eqx.field(converter=as_number, default=0.0)
+    spinning: Number = eqx.field(converter=as_number, default=0.0)
     rolls: ClassVar[bool | None] = True
 
     def __check_init__(self):
@@ -159,7 +180,10 @@ class Frictional(AbstractContactLaw):
     def admissible(self) -> list:
         sentence = f"`friction` must not be negative, but got {self.friction}; 0 is a smooth wall"
         tangential = _within("tangential", self.tangential, -1.0, 1.0, "1 reverses the slip, -1 keeps it")
-        return [*super().admissible(), tangential, (self.friction >= 0, sentence)]
+        return [*super().admissible(), tangential, (self.friction >= 0, sentence), *_resists(self)]
+
+    def resistance(self) -> tuple[Number, Number]:
+        return self.rolling, self.spinning
 
     def slip_factor(self, inertia_ratio: Number, closing_speed: Number, slip_squared: Number) -> Number:
         gripping = times(1 + self.tangential, _grip(inertia_ratio))

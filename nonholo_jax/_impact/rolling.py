@@ -46,6 +46,18 @@ def heading(slip: Vector3, along: Vector3, most: Number) -> Vector3:
     return tuple(jnp.where(slides, ratio(x, size), 0.0) for x in towards)  # pyright: ignore
 
 
+def twist(radius: Number, pivot: Number, normal: Vector3, turn: Vector3) -> Vector3:
+    """r (omega . n) n x dn/dt: how a spin about the normal drives the contact point of a ball aside whose normal turns.
+    With it, on any surface, the slip changes by du/dt = g_t - twist - F u/|u|, and a ball that rolls has
+    (1 + alpha) dv_t/dt = g_t + alpha twist, with d(omega . n)/dt = omega . dn/dt."""
+    return scale(radius * pivot, cross(normal, turn))
+
+
+def spin_loss(ball: Any, coefficient: Number, push: Number) -> Number:
+    """What spinning friction takes of the spin about the normal in a second, for a push per mass."""
+    return ratio(coefficient * push, ball.inertia_ratio * ball.radius)
+
+
 def later_heading(slip: Vector3, known: Vector3) -> Vector3:
     """The direction of a slip within an arc that began with a `known` one. Beyond the end of the slip, which the arc
     will be cut at, the slip is mirrored there: a straight slide stays smooth, so that a solver may step over its end,

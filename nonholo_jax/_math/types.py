@@ -43,12 +43,13 @@ class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
         "the corner off."
     )
     pivoting = (
-        "The ball came to the edge of a face too slowly to fly off (v^2 < g r across the edge): it would tip over the "
-        "edge, which is not computed. Try more speed, an earlier `t1`, or `throw=False` and `Trajectory.t1`."
+        "The ball came to the edge of a face too slowly to fly off (v^2 < g r across the edge): it tips over the edge, "
+        "which this motion does not follow. Try `motion=Exact(contact=Integrated())` (in air `Integrated(edges=True)`)."
     )
     sustained_contact = (
-        "The ball stays in contact with a surface (it rests, rolls, or its bounces have died out below rounding). "
-        "Try an earlier `t1`, or `throw=False` and `Trajectory.t1` for the time reached."
+        "The ball stays in contact with a surface (it rests, rolls, or its bounces have died out below rounding) in a "
+        "way that this motion does not follow. Try `motion=Exact(contact=Integrated())` (in air "
+        "`Integrated(edges=True)`), or `throw=False` and `Trajectory.t1` for the time reached."
     )
     curved_slide = (
         "The ball slides across a slope, against friction: its slip turns, so that its path is no parabola. Try "
@@ -61,7 +62,7 @@ class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     )
 
 
-NO_IMPACTS = ("left", "gripped", "passed")
+NO_IMPACTS = ("left", "gripped", "slipped", "stopped", "passed")
 NAMES_OF_RESULTS = tuple(RESULTS._name_to_item)
 
 
@@ -106,9 +107,14 @@ class KINDS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     bounce = "One impact."
     train = "Infinitely many impacts that end in finite time; then the ball stays on the surface. One, if plastic."
     rolling = "An impact after which the ball goes on along the surface that it was on, or comes to lie on one."
-    left = "The ball leaves a face over its edge, without an impact."
+    left = "The ball leaves a surface, over its edge or where that would have to pull it, without an impact."
     gripped = (
         "The slip of a ball that slid has died out, without an impact: from here it rolls, or, where it is too steep "
         "for that, slides downhill."
     )
-    passed = "The ball goes on from one face to another one that is flush with it, without an impact."
+    passed = (
+        "The ball goes on from one face to another one that is flush with it, or to a part of its surface that bends "
+        "otherwise, without an impact."
+    )
+    stopped = "Rolling resistance, or spinning friction, has stopped what it acts against, without an impact."
+    slipped = "A ball that rolled begins to slip, as friction cannot hold it any more, without an impact."

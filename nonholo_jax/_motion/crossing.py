@@ -48,6 +48,7 @@ class Arc(eqx.Module):
     rate: tuple[Polynomial, ...]
     length: Number
     unit: Number
+    is_parabola: Any = None  # where only the program that runs knows whether it is one
 
     def position(self, s: Number) -> tuple:
         return tuple(evaluate(p, s) for p in self.configuration)
@@ -116,10 +117,13 @@ def _is_exact(system: AbstractSystem, contact: Any, path: Sequence[Polynomial]) 
 
 def _return(system: AbstractSystem, contact: Any, arc: Arc) -> Return | None:
     """When a parabola that begins on a flat face comes back to it."""
-    if any(len(p) > 3 for p in arc.configuration):
+    if any(len(p) > 3 for p in arc.configuration) and arc.is_parabola is None:
         return None
     q, v, half_a = (tuple(p[k] if len(p) > k else 0.0 for p in arc.configuration) for k in range(3))
-    return system.returns(contact, arc.time, q, v, half_a, arc.start)
+    back = system.returns(contact, arc.time, q, v, half_a, arc.start)
+    if back is None or arc.is_parabola is None:
+        return back
+    return back._replace(comes=back.comes & arc.is_parabola)
 
 
 def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, window: Any, touching: Any) -> _Step:
@@ -128,8 +132,13 @@ def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, wind
     value, rate = slope(lambda x: system.level(contact, arc.time, x, arc.start), here.position, here.tangent)
     noise = rounding(system, contact, here.size, s.dtype)
     exact = _is_exact(system, contact, coefficients)
+    perhaps = arc.is_parabola if system.is_parabolic(contact) and not exact else None
     # A contact that has just been left has a gap of exactly zero that does not close; rounding may not say otherwise.
-    left_behind = (touching == _number(contact)) & (s == 0)
+    left_behind, opens = (touching == _number(contact)) & (s == 0), False
+    may_open = system.n_derived > 0 and isinstance(contact, Member)
+    if may_open:
+        opens = (touching == _number(contact) + system.n_contacts) & (s == 0)
+        left_behind = left_behind | opens
     width: Any = left
     if not exact:  # the reach is a first guess; from then on the window knows better
         reach = system.reach(contact, here.position)
@@ -165,9 +174,19 @@ def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, wind
     last = where(closes, jnp.minimum(jnp.minimum(comes, zero), left), 0.0)
     size, clear = where(hit, last, jnp.minimum(zero, width)), zero >= width
     back = _return(system, contact, arc)
+    if may_open:
+        # It moves off with neither velocity nor acceleration: at first no bound sees that it is off.
+        bends = 2.0 * norm(here.half_bends)
+        soon = jnp.minimum(left, where(bends > 0, here.speed / where(bends > 0, bends, 1.0), left))
+        size = where(opens, max(1e-3, float(jnp.finfo(s.dtype).eps) ** 0.25) * soon, size)
+        hit, clear = hit & ~jnp.asarray(opens), clear & ~jnp.asarray(opens)
+    if perhaps is not None:
+        known, flies = _Step(zero, zero <= left, zero > left, rate, m, noise, True), perhaps & ~jnp.asarray(opens)
+        size, hit, clear = (where(flies, a, b) for a, b in ((known.size, size), (known.hit, hit), (known.clear, clear)))
+        return _Step(size, hit, clear, rate, m, noise, flies, look)
     if back is None:
         return _Step(size, hit, clear, rate, m, noise, False, look)
-    falls = back.comes & left_behind
+    falls = back.comes & left_behind & ~jnp.asarray(opens)
     size, hit, clear = where(falls, back.duration, size), where(falls, back.duration <= left, hit), clear & ~falls
     rate, m = where(falls, back.rise, rate), where(falls, times(-2.0, back.pull), m)
     return _Step(size, hit, clear, rate, m, noise, falls)
@@ -254,10 +273,12 @@ def _rests(first: _Step, hit: Any, speed: Number, dtype: Any) -> tuple[Any, Any]
 _NOTHING = (0.0, 0.0, 0.0, False)  # of a level that is never zero
 
 
-def _noise(system: AbstractSystem, contact: Any, arc: Arc) -> float:
+def _noise(system: AbstractSystem, contact: Any, arc: Arc) -> Number:
     """The part of the speed below which the rate of a level at its zero is rounding. On a plane it is that of the
     velocity; elsewhere the zero itself is known only to the root of rounding where the level hardly changes."""
     eps = float(jnp.finfo(arc.time.dtype).eps)
+    if arc.is_parabola is not None and system.is_parabolic(contact):
+        return where(arc.is_parabola, 4.0 * eps, eps**0.5)
     return 4.0 * eps if _is_exact(system, contact, arc.configuration) else eps**0.5
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -46,6 +46,9 @@ class Integrated(AbstractMotion):
     - `dt0`: first step in s, or `None` to have it chosen.
     - `max_steps`: bound on the number of accepted steps (arcs, each cut short by an impact included), after which the
         result is `step_limit`.
+    - `edges`: whether a ball that stays on a surface also goes on over the edges and corners of boxes and plates, and
+        rests or rolls on elastic surfaces; this makes a longer program. `None`: where the scene has a sphere, a
+        cylinder or an `Implicit` to stay on, on which it rolls in any case.
     - `unroll`: speed only. Whether the stages of a step are written out one after the other, over scalars, which is
         quicker in batches and takes longer to compile; `None` does so in batches of balls.
     - `safe_steps`, `tile`: speed only. How often one turn of the event loop may look ahead for a crossing, and how many
@@ -69,7 +72,11 @@ class Integrated(AbstractMotion):
     safe_steps: int = eqx.field(static=True, default=3)
     tile: int = eqx.field(static=True, default=64)
     unroll: bool | None = eqx.field(static=True, default=None)
-    is_closed_form: ClassVar[bool] = False
+    edges: bool | None = eqx.field(static=True, default=None)
+
+    @property
+    def is_closed_form(self):
+        return False
 
     def __check_init__(self):
         explicit = isinstance(self.solver, diffrax.AbstractERK) or not isinstance(
@@ -135,19 +142,28 @@ class Integrated(AbstractMotion):
         size, memo = controller.init(still, zero, init[1], init[0], dt0, None, func, order)
         return _Control(frozen(jnp.asarray(size, dtype=time.dtype)), jax.tree.map(jnp.asarray, memo)), memory
 
-    def size(self, control, left):
+    def shortened(self, control, size):
+        return control if self._is_constant else control._replace(size=size)
+
+    @property
+    def steps(self) -> bool:
+        """Whether it can step through the contacts of an `Exact` motion."""
+        return isinstance(self.solver, diffrax.AbstractERK)
+
+    def size(self, control, left, stays):
         return jnp.minimum(control.size, left)
 
     def piece(self, system, time, state, memory, jumped, size):
         if isinstance(self.solver, diffrax.AbstractERK):
-            return _runge_kutta_step(self.solver, system, time, state, size, not self.unroll)
+            piece = _runge_kutta_step(self.solver, system, time, state, size, not self.unroll)
+            return piece._replace(arc=_with_derived(system, piece.arc))
         z0 = _arrays(system.evolving(state), time)
         z1, error, info, memory, _ = self.solver.step(_term(system, state), time, time + size, z0, None, memory, jumped)
         path = self.solver.interpolation_cls(t0=time, t1=time + size, **info)
-        arc = _fitted_arc(path, z0, time, state, size)
+        arc = _with_derived(system, _fitted_arc(path, z0, time, state, size))
         return Piece(arc, memory, (z0, z1, error))
 
-    def judge(self, control, size, trial):
+    def judge(self, control, size, trial, stays):
         z0, z1, error = frozen(trial)
         if self._is_constant:
             return jnp.asarray(True), control
@@ -309,6 +325,27 @@ def interpolation_weights(solver: Any) -> np.ndarray:
             f"Argument `solver` must have a polynomial interpolant, but got {solver}; try diffrax.Tsit5()."
         )
     return weights
+
+
+def _with_derived(system: Any, arc: Arc) -> Arc:
+    """An arc with polynomials of what gaps see beside the configuration."""
+    if system.n_derived == 0:
+        return arc
+    degree = system.degree_of_derived
+    nodes = 0.5 - 0.5 * np.cos(np.pi * np.arange(degree + 1) / degree)
+    inverse = np.zeros((degree + 1, degree + 1))
+    inverse[0, 0], inverse[1:, 1:] = 1.0, np.linalg.inv(nodes[1:, None] ** np.arange(1, degree + 1))
+    inverse[1:, 0] = -np.sum(inverse[1:, 1:], axis=1)
+
+    def sample(s: Any) -> tuple:
+        found = system.derived(arc.time + s * arc.unit, arc.start, arc.position(s), arc.velocity(s))
+        return tuple(jnp.asarray(x, s.dtype) for x in found)
+
+    values = jax.vmap(sample)(jnp.asarray(nodes, arc.length.dtype))  # pyright: ignore
+    weights = jnp.asarray(inverse, arc.length.dtype)  # pyright: ignore
+    fitted = [jnp.sum(weights * x[None], axis=1) for x in values]
+    configuration = (*arc.configuration, *[tuple(x[i] for i in range(degree + 1)) for x in fitted])
+    return dataclasses.replace(arc, configuration=configuration)
 
 
 def _fitted_arc(path: Any, z0: Any, time: Any, state: Any, h: Any) -> Arc:

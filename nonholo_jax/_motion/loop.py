@@ -256,15 +256,16 @@ def turn(
 ) -> Carry:
     """One turn: search one arc a little further; where that ends it, finish it. `differentiable` turns have derivatives
     of their own."""
-    active, left = ~c.done, t1 - c.time + c.ahead
-    size = where(active, motion.size(c.control, left), 1.0)  # finished lanes compute harmless numbers
+    active, left, stays = ~c.done, t1 - c.time + c.ahead, system.phase(c.state) >= 0
+    size = where(active, motion.size(c.control, left, stays), 1.0)  # finished lanes compute harmless numbers
     last = size >= left
     length = where(last, left, frozen(size))
     ready = system.prepared(c.time, c.state)
     piece = motion.piece(system, c.time, ready, c.memory, c.jumped, length)
     arc = piece.arc
-    kept, control = motion.judge(c.control, size, piece.trial)
+    kept, control = motion.judge(c.control, size, piece.trial, stays)
     found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
+    kept, control = _ending_there(system, motion, arc, found, kept, stays, control)
     kept, finished = _shared_flags((kept, found.finished))
     ended = active & kept & finished
     crossed, contact = ended & (found.contact >= 0), system.choice(found.contact)
@@ -282,9 +283,9 @@ def turn(
     since = c.since + elapsed
     n_at_once = _at_once(c, arc, s, since, found.contact)
     full, stuck = c.n_impacts >= allowed(c, max_impacts), n_at_once > _MOST_IMPACTS_AT_ONCE
-    met, name = Meeting(KINDS.unused, RESULTS.reached_t1, arrived, 0.0, False), found.contact
+    met, name, left_by = Meeting(KINDS.unused, RESULTS.reached_t1, arrived, 0.0, False), found.contact, 0
     if system.n_contacts > 0:
-        name = system.named(contact, arrived)
+        name, left_by = system.named(contact, arrived), system.left_by(contact)
         met = system.meets(contact, time, arrived, t1 - time, found.rests, found.ends)
     after, n_passed = as_arrays(met.after, t1.dtype), c.n_passed
     if n_passed is not None:  # a hand-over is no impact, and is named by what the ball comes onto
@@ -302,8 +303,7 @@ def turn(
 
     finite = jnp.isfinite(total([time, *jax.tree.leaves(jax.tree.map(jnp.sum, arrived))]))
     (broken,) = _shared_flags((ended & ~finite,))
-    n_arcs = c.n_arcs + ended.astype(jnp.int32)
-    most = system.most_rows(max_impacts)
+    n_arcs, most = c.n_arcs + ended.astype(jnp.int32), system.most_rows(max_impacts)
     exhausted = (c.n_turns + 1 >= motion.max_turns(most)) | (n_arcs >= motion.max_pieces(most))
     exhausted = active & exhausted & ~(reached | stopped | settled | broken)
     faults = [(full, RESULTS.max_impacts), (stuck, RESULTS.corner), (failed, met.fault)]
@@ -317,7 +317,7 @@ def turn(
         memory=keep(ended, piece.memory, c.memory),
         s=where(goes_on, frozen(found.s), 0.0),
         window=where(goes_on, frozen(found.window), jnp.inf),
-        touching=where(struck, name, where(through, np.int32(-1), c.touching)),
+        touching=where(struck, name + left_by, where(through, np.int32(-1), c.touching)),
         jumped=where(ended, struck, c.jumped),
         control=keep(active & (ended | ~kept), control, c.control),
         since=where(struck, 0.0, where(ended, since, c.since)),
@@ -331,6 +331,19 @@ def turn(
         log=log,
         path=path,
     )
+
+
+def _ending_there(
+    system: AbstractSystem, motion: AbstractMotion, arc: Any, found: Any, kept: Any, stays: Any, control: Any
+) -> tuple[Any, Any]:
+    """What ends a contact is found on an interpolant, which is best at both ends of a step: where it is further from
+    them, the step is not kept, and the next one ends just behind it."""
+    if system.n_derived == 0:
+        return kept, control
+    inside = (found.s > 1e-3 * arc.length) & (found.s < 0.99 * arc.length)
+    early = stays & kept & found.finished & (found.contact >= 0) & inside
+    shortened = motion.shortened(control, (1.0 + 1e-5) * frozen(found.s * arc.unit))
+    return kept & ~early, keep(early, shortened, control)
 
 
 def allowed(c: Carry, max_impacts: int) -> Any:

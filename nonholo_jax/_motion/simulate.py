@@ -26,7 +26,8 @@ from .._math import (
     result_name,
     with_options,
 )
-from .._world import AbstractSystem, Scene, grounded, slides_across
+from .._staying import grounded, slides_across, stays_curved
+from .._world import AbstractSystem, Scene
 from .accuracy import motion_for
 from .integrated import Integrated
 from .motion import AbstractMotion, Exact
@@ -190,7 +191,9 @@ def _continued(scene: AbstractSystem, motion: AbstractMotion, sum_trains: bool) 
     """The system with the motion after the last bounce, where there may be one."""
     if not (sum_trains and isinstance(scene, Scene)):
         return scene
-    return grounded(scene, float(getattr(motion, "atol", 0.0)), motion.is_closed_form)
+    steps = getattr(motion, "contact", None) or motion
+    curved = isinstance(steps, Integrated) and (steps is not motion or stays_curved(scene, steps.edges))
+    return grounded(scene, float(getattr(steps, "atol", 0.0)), motion.is_closed_form, curved)
 
 
 def _check_scene(scene: Any, axes: tuple) -> None:
@@ -305,7 +308,8 @@ def checked(
     chosen = motion is None
     if chosen:
         closed = Exact.serves(scene) and not (slides and isinstance(scene, Scene) and slides_across(scene))
-        motion = Exact() if closed else Integrated()
+        stays = slides and isinstance(scene, Scene) and stays_curved(scene, None)
+        motion = Exact(contact=Integrated() if stays else None) if closed else Integrated()
         motion = motion if wanted is None else motion_for(scene, *wanted, closed_form=closed)
     if not isinstance(motion, AbstractMotion):
         raise ValueError(f"Argument `motion` must be None, Exact() or Integrated(), but got {motion!r}; try None.")

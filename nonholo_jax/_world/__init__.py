@@ -3,11 +3,34 @@
 from .air import Air as Air
 from .ball import Ball as Ball, BallState as BallState, check_ball_state as check_ball_state
 from .box import Box as Box, Rectangle as Rectangle
-from .grounded import grounded as grounded
 from .lagrangian import Barrier as Barrier, LagrangianSystem as LagrangianSystem, as_arrays as as_arrays
-from .round import Cylinder as Cylinder, Sphere as Sphere
-from .scene import Scene as Scene
-from .settling import slides_across as slides_across
-from .surface import AbstractSurface as AbstractSurface, Implicit as Implicit, Plane as Plane, Return as Return
-from .system import AbstractSystem as AbstractSystem, Meeting as Meeting, magnitude as magnitude, rounding as rounding
-from .touching import Member as Member, Stack as Stack
+from .round import (
+    Cylinder as Cylinder,
+    Sphere as Sphere,
+    round_bend as round_bend,
+    round_level as round_level,
+)
+from .scene import Flight as Flight, Scene as Scene
+from .surface import (
+    AbstractSurface as AbstractSurface,
+    Face as Face,
+    Implicit as Implicit,
+    Plane as Plane,
+    Return as Return,
+)
+from .system import (
+    AbstractSystem as AbstractSystem,
+    Meeting as Meeting,
+    bounces as bounces,
+    magnitude as magnitude,
+    rounding as rounding,
+)
+from .touching import (
+    Member as Member,
+    Neighbours as Neighbours,
+    Stack as Stack,
+    Support as Support,
+    may_be_flush as may_be_flush,
+    neighbours as neighbours,
+    numbers_of as numbers_of,
+)

@@ -80,8 +80,9 @@ def _box_bend(window: Window, axes: tuple, center: Vector3, half: Vector3, radiu
     return Interval(ratio(total(lows), radius), ratio(total(highs), radius))
 
 
-def _box_direction(y: Vector3, half: Vector3, axes: tuple) -> Vector3:
-    n = unit([where(c < 0, times(-1.0, e), e) for c, e in zip(y, _excess(y, half), strict=True)])
+def _box_direction(y: Vector3, half: Vector3, axes: tuple, excess: Vector3 | None = None) -> Vector3:
+    excess = _excess(y, half) if excess is None else excess
+    n = unit([where(c < 0, times(-1.0, e), e) for c, e in zip(y, excess, strict=True)])
     return add(add(scale(n[0], axes[0]), scale(n[1], axes[1])), scale(n[2], axes[2]))
 
 
@@ -161,6 +162,19 @@ class AbstractBlock(AbstractSurface):
         others = [[*things[i:], *things[:i]] for things in (axes, half) for i in (1, 2)]
         sides = [(tuple(pick(column) for column in zip(*others[i], strict=True)), pick(others[i + 2])) for i in (0, 1)]
         return center, sides
+
+    def direction_within(self, x, t, beyond):
+        center, half, axes = self._frame()
+        y, flags = _in_frame(x, center, axes), iter(beyond)
+        within = [is_constant(h) and h == 0 for h in half]  # no seam there
+        excess = tuple(abs(c) if none else where(next(flags), plus(abs(c), times(-1.0, h)), 0.0)
+                       for c, h, none in zip(y, half, within, strict=True))  # fmt: skip
+        return _box_direction(y, half, axes, excess)  # pyright: ignore
+
+    def seams(self):
+        center, half, axes = self._frame()
+        thick = [not (is_constant(h) and h == 0) for h in half]
+        return [(axis, center, h) for axis, h, there in zip(axes, half, thick, strict=True) if there]
 
     def directions(self):
         axes = self._frame()[2]

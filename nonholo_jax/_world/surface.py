@@ -131,6 +131,17 @@ class AbstractSurface(eqx.Module):
         del n
         return None
 
+    def seams(self) -> Sequence[tuple[Vector3, Vector3, Number]]:
+        """Pairs of planes across which the curvature of the surface jumps: the direction across, a point in the middle
+        between the two, and half the distance."""
+        return ()
+
+    def direction_within(self, x: Vector3, t: Number, beyond: Sequence[Any]) -> Vector3:
+        """The unit normal of the part of the surface that is, or is not, beyond each pair of `seams`, also where the
+        point is not on that part any more."""
+        del beyond
+        return self.direction(x, t)
+
     def directions(self) -> Sequence[Vector3]:
         """Directions along which this surface may be apart from others, with the normals of its faces among them."""
         return ()

@@ -33,6 +33,21 @@ class AbstractSystem(eqx.Module):
     may_stay: ClassVar[bool] = False  # whether it may go on in contact: then its phase decides how it moves
     may_pass: ClassVar[bool] = False  # whether it may be handed over from one contact to another, without an impact
 
+    n_derived: ClassVar[int] = 0  # how many numbers gaps see beside those that evolve: see `derived`
+    degree_of_derived: ClassVar[int] = 4  # of the polynomials that they are along an arc
+
+    def derived(self, time: Scalar, state: Any, q: tuple, v: tuple) -> tuple[Number, ...]:
+        """Smooth functions of the motion whose zeros are contacts: what a gap sees of them along an arc is a polynomial
+        through samples. For motions that step."""
+        del time, state, q, v
+        return ()
+
+    def left_by(self, contact: Choice) -> Any:
+        """What the search is told beside the number of the contact that is left: `n_contacts` if the state moves off it
+        with neither velocity nor acceleration, as where its push ends, else 0."""
+        del contact
+        return 0
+
     def most_rows(self, max_impacts: int) -> int:
         """How many rows a log may need for so many impacts."""
         return 2 * max_impacts + 8 if self.may_pass else max_impacts

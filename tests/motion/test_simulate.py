@@ -103,7 +103,7 @@ def ways_to_end():
             (SCENE, resting, {}),
             (plastic, THROW, {"sum_trains": False}),
             (inelastic, THROW, {"t1": 10.0, "max_impacts": 200, "sum_trains": False}),
-            (bowl, drop, {"t1": 10.0, "max_impacts": 200}),
+            (bowl, drop, {"t1": 10.0, "max_impacts": 200, "motion": Exact()}),
         ],
     }
 

@@ -333,11 +333,14 @@ def test_slow_ball_tips_by_name():
     assert [result_of(end) for end in ends] == ["pivoting", "reached_t1"]
 
 
-def test_resting_on_what_cannot_hold_it_is_named():
+def test_resting_in_a_bowl_is_followed_where_a_motion_is_chosen_and_named_where_it_is_not():
     law, below = Rough(0.5), (0.0, 0.0, -1.0)
     bowl = Scene(BALL, {"bowl": Sphere((0.0, 0.0, 1.0), 1.0, law, inside=True), "floor": Plane(below, UP, law)})
-    end = simulate(bowl, BallState([0.0, 0.0, 0.9], STILL, STILL), t1=9.0, throw=False, max_impacts=200)
-    assert result_of(end) == "sustained_contact"
+    for motion, result in ((None, "at_rest"), (Exact(), "sustained_contact")):
+        end = simulate(
+            bowl, BallState([0.0, 0.0, 0.9], STILL, STILL), t1=9.0, motion=motion, throw=False, max_impacts=200
+        )
+        assert result_of(end) == result
 
 
 # All of it together

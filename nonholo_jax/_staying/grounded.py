@@ -10,19 +10,24 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from .._impact import rolling, train
 from .._math import (
     KINDS,
     Hopper,
+    Interval,
     Number,
     Vector3,
     add,
     cross,
     dot,
+    frozen,
     maximum,
     minimum,
+    norm,
+    ratio,
     rolled,
     scale,
     subtract,
@@ -30,11 +35,10 @@ from .._math import (
     where,
     where_vector,
 )
-from .round import round_bend, round_level
-from .scene import Scene
-from .settling import Floors, Ground, Settling, Travel, phase_of
-from .system import AbstractSystem, Meeting, bounces
-from .touching import Member, may_be_flush
+from .._world import AbstractSystem, Meeting, Member, Scene, bounces, may_be_flush, round_bend, round_level
+from .floors import Floors
+from .ground import Ground, Travel, phase_of
+from .settling import Settling
 
 
 def _if_any(condition: Any, wanted: Callable, plain: Callable) -> Any:
@@ -57,6 +61,7 @@ class Grounded(AbstractSystem):
     tolerance: float = eqx.field(static=True)
     parabolic: bool = eqx.field(static=True)
     hits: bool = eqx.field(static=True)
+    curved: bool = eqx.field(static=True)
     may_pass: bool = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
     is_long: ClassVar[bool] = False
     may_stay: ClassVar[bool] = True
@@ -68,9 +73,11 @@ class Grounded(AbstractSystem):
         parabolic: bool = False,
         hits: bool = True,
         may_pass: bool | None = None,
+        curved: bool = False,
     ):
         self.scene, self.tolerance, self.parabolic, self.hits = scene, tolerance, parabolic, hits
-        self.may_pass = may_be_flush(scene.surfaces, scene.ball.radius) if may_pass is None else may_pass
+        self.curved, has_seams = curved, curved and Floors(scene, curved).n_seams > 0
+        self.may_pass = has_seams or may_be_flush(scene.surfaces, scene.ball.radius) if may_pass is None else may_pass
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,11 +85,11 @@ class Grounded(AbstractSystem):
 
     @property
     def _settling(self) -> Settling:
-        return Settling(self.scene, self.tolerance, self.parabolic, Floors(self.scene), self.may_pass)
+        return Settling(self.scene, self.tolerance, self.parabolic, self._floors, self.may_pass)
 
     @property
     def _floors(self) -> Floors:
-        return Floors(self.scene)
+        return Floors(self.scene, self.curved)
 
     @property
     def _n_surfaces(self) -> int:
@@ -94,7 +101,8 @@ class Grounded(AbstractSystem):
 
     @property
     def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return (self._end_of_slip + self._floors.have_friction) if self.hits else 0
+        settling = self._settling
+        return (settling.end_of_hold + settling.follows_hold) if self.hits else 0
 
     def engine(self, dtype):
         return dataclasses.replace(self, scene=self.scene.engine(dtype))
@@ -115,9 +123,13 @@ class Grounded(AbstractSystem):
 
     def evolving(self, state: Travel):
         position, velocity = self.scene.evolving(state.flight)
-        if not self._floors.have_friction:
-            return position, velocity
-        return (*position, *(rolling.NONE if state.below is None else state.below.slip)), velocity
+        slip = (rolling.NONE if state.below is None else state.below.slip) if self._floors.have_friction else ()
+        pivot = (0.0 if state.below is None else state.below.pivot,) if self.curved else ()
+        speed: tuple = ()
+        if self._floors.resist[0]:  # of a ball that rolls against resistance
+            known = None if state.below is None else state.below.brake
+            speed = (0.0 if known is None else dot(known.heading, velocity),)
+        return (*position, *slip, *pivot, *speed), velocity
 
     def is_uniform(self):
         return self.scene.is_uniform()
@@ -126,47 +138,97 @@ class Grounded(AbstractSystem):
         return state._replace(below=self._settling.ground(time, state))
 
     def derivative(self, time, state, q, v):
-        flight, below = state.flight, self._below(time, state)
-        n, free, (q, slip) = below.face.normal, below.free, (q[:3], q[3:])
-        if self.scene.air is not None:  # a ball that rolls turns as it goes
-            turning = subtract(v, slip) if slip else v
-            flight = flight._replace(spin=add(free.spin, scale(free.turning, cross(n, turning))))
-        _, a = self.scene.derivative(time, flight, q, v)
-        push = dot(n, a)
-        rate = subtract(a, scale(free.held * push, n))
-        if not slip:
-            return v, scale(free.share, rate)
-        changes = self._slip_rate(below, slip, rate, push)
-        # Friction leaves v + alpha r (omega x n) alone, so that (1 + alpha) v - alpha u changes by gravity only.
-        with_slip = scale(free.share, add(rate, scale(self.scene.ball.inertia_ratio, changes)))
-        return (*v, *changes), where_vector(below.rolls, with_slip, scale(free.share, rate))
+        below, settling = self._below(time, state), self._settling
+        slip, _ = settling.inner(q)
+        free, alpha = below.free, self.scene.ball.inertia_ratio
+        forced = settling.forced(time, state, below, q, v)
+        n, rate = forced.normal, forced.along
+        if self.curved:
+            rate = subtract(rate, forced.twist)
+        changes = settling.slip_rate(below, slip, rate, forced.push) if slip else ()
+        if self.curved:
+            rate = add(rate, scale(1.0 + alpha, forced.twist))
+        if slip:
+            # Friction leaves v + alpha r (omega x n) alone, so that (1 + alpha) v - alpha u changes by gravity only.
+            with_slip = scale(free.share, add(rate, scale(alpha, changes)))
+            rate = where_vector(below.rolls, with_slip, scale(free.share, rate))
+        else:
+            rate = scale(free.share, rate)
+        slows: tuple = ()
+        if below.brake is not None:
+            rate = where_vector(below.brake.holds, rolling.NONE, subtract(rate, settling.braked(below, forced, v)))
+            slows = (dot(below.brake.heading, rate),)
+        if not self.curved:
+            return (*v, *changes, *slows), rate
+        rate = subtract(rate, scale(dot(forced.turn, v), n))
+        changes = subtract(changes, scale(dot(forced.turn, slip), n)) if slip else ()
+        spun = dot(scale(free.turning, cross(n, subtract(v, slip) if slip else v)), forced.turn)
+        if below.spinning is not None:
+            coefficient, sign = below.spinning
+            lost = rolling.spin_loss(self.scene.ball, coefficient, -forced.push)
+            spun = where((sign == 0) & (coefficient > 0), 0.0, spun - sign * lost)
+        return (*v, *changes, spun, *slows), rate
+
+    @property
+    def n_derived(self) -> int:
+        return int(self._settling.follows_hold and self.hits)
+
+    @property
+    def degree_of_derived(self) -> int:
+        return 7 if self.curved else 4
+
+    def derived(self, time, state, q, v):
+        """By how much the surface below pushes, or, where a ball rolls that may slip, by how much friction could do
+        more: in metres, and 1 where there is nothing to hold."""
+        below, settling = self._below(time, state), self._settling
+        slip, _ = settling.inner(q)
+        forced = settling.forced(time, state, below, q, v)
+        radius, on = self.scene.ball.radius, phase_of(state) >= 0
+        size = frozen(norm(forced.along) + abs(forced.push))
+        hold = ratio(times(-radius, forced.push), size)
+        if slip:
+            assert below.friction is not None
+            limited = below.rolls & jnp.isfinite(below.friction) & (dot(below.heading, below.heading) == 0)
+            most = where(limited, below.friction, 0.0) * -forced.push * (1.0 + 1.0 / self.scene.ball.inertia_ratio)
+            drive = subtract(forced.along, forced.twist)
+            if below.brake is not None:
+                drive = add(drive, scale(1.0 + 1.0 / self.scene.ball.inertia_ratio, settling.braked(below, forced, v)))
+            spare = ratio(radius * (most * abs(most) - dot(drive, drive)), frozen(most * most + dot(drive, drive)))
+            hold = where(limited, spare, hold)
+        return (where(on, hold, 1.0),)
 
     def rate_of(self, time, state):
         return state.flight.velocity
 
-    def _slip_rate(self, below: Ground, slip: Vector3, along: Vector3, push: Number) -> Vector3:
-        """The rate of the slip, zero for a ball that does not slide against friction."""
-        slides, heading = dot(below.heading, below.heading) > 0, below.heading
-        assert below.friction is not None
-        most = where(slides, below.friction, 0.0) * -push
-        most = most * (1.0 + 1.0 / self.scene.ball.inertia_ratio)
-        rate = scale(dot(along, heading) - most, heading)
-        if not self.parabolic:
-            turning = subtract(along, scale(most, rolling.later_heading(slip, heading)))
-            rate = where_vector(below.straight, rate, turning)
-        return where_vector(slides, rate, rolling.NONE)
-
     def advanced(self, time, state, q, v, duration):
         flight = self.scene.advanced(time, state.flight, q[:3], v, duration)
-        below = self._below(time, state)
-        n, free, orientation = below.face.normal, below.free, flight.orientation
-        spin = add(free.spin, scale(free.turning, cross(n, subtract(v, q[3:]) if q[3:] else v)))
+        below, settling = self._below(time, state), self._settling
+        slip, pivot = settling.inner(q)
+        n, free, orientation, still = below.face.normal, below.free, flight.orientation, below.free.spin
+        if self.curved:
+            flight = self._settling.placed(time, state.support, flight)
+            face, _ = self._floors.face(self.scene.choice(phase_of(state)), flight.position, time)
+            n, v = where_vector(state.support >= 0, face.normal, below.face.normal), flight.velocity
+            still = where_vector(below.rolls, scale(pivot, n), free.spin)
+            slip = rolling.along_surface(n, slip) if slip else slip
+        elif below.spinning is not None:
+            still = self._spun_down(time, state, below, duration)
+        spin = add(still, scale(free.turning, cross(n, subtract(v, slip) if slip else v)))
         if orientation is not None:
             turning = subtract(state.flight.velocity, below.slip)
-            before = add(free.spin, scale(free.turning, cross(n, turning)))
+            before = add(free.spin, scale(free.turning, cross(below.face.normal, turning)))
             turned = rolled(state.flight.orientation, before, spin, duration, orientation.dtype)
             orientation = jnp.where(below.rolls, turned, orientation)
         return Travel(flight._replace(spin=spin, orientation=orientation), state.support)
+
+    def _spun_down(self, time: Any, state: Travel, below: Ground, duration: Any) -> Vector3:
+        """The spin about the normal after so many seconds on a flat surface."""
+        assert below.spinning is not None
+        coefficient, sign = below.spinning
+        n, pivot = below.face.normal, dot(below.face.normal, below.free.spin)
+        lost = rolling.spin_loss(self.scene.ball, coefficient, -dot(n, self._settling.pull(time, state.flight)))
+        left = sign * maximum(abs(pivot) - lost * duration, 0.0)
+        return where_vector(below.rolls, scale(left, n), below.free.spin)
 
     # Contacts
 
@@ -175,6 +237,11 @@ class Grounded(AbstractSystem):
 
     def named(self, contact, state):
         return where(contact.index >= self._n_surfaces, self.phase(state), contact.index)
+
+    def left_by(self, contact):
+        if not self._settling.follows_hold:
+            return 0
+        return where(contact.index == self._settling.end_of_hold, np.int32(self.n_contacts), np.int32(0))
 
     def _below(self, time: Any, state: Travel) -> Ground:
         return self._settling.ground(time, state) if state.below is None else state.below
@@ -198,12 +265,35 @@ class Grounded(AbstractSystem):
                 away = where(found.flush, functools.reduce(maximum, entry or [1.0]), away)
                 on = on | found.inside
             return where(on, 1.0, away)
-        if contact == self._end_of_slip:
+        if contact == self._end_of_slip and self._floors.have_friction:
             heading = self._below(time, state).heading
-            return where(dot(heading, heading) > 0, dot(heading, q[3:]), 1.0)
+            return where(dot(heading, heading) > 0, dot(heading, q[3:6]), 1.0)
+        settling = self._settling
+        if contact == settling.end_of_hold:
+            return q[-1]
+        if contact >= settling.end_of_roll:
+            sign, k = self._dying(contact, time, state)
+            unit = 1.0 if contact == settling.end_of_roll else self.scene.ball.radius
+            return where(sign != 0, sign * q[k] * unit, 1.0)
+        if self.curved:
+            beyond, across, middle, half, present = self._below(time, state).seams[contact - self._n_surfaces]
+            away = round_level((dot(across, subtract(x, middle)),), half, False)
+            return where(present, where(beyond, away, times(-1.0, away)), 1.0)
         across, middle, half, present = self._exit(contact, state, time)
         y = dot(across, subtract(x, middle))
         return where(present, round_level((y,), half, True), 1.0)
+
+    def _dying(self, contact: int, time: Any, state: Travel) -> tuple[Any, int]:
+        """Of rolling, or of spinning about the normal, that resistance stops: its sign, zero where there is none, and
+        which number of the configuration it is."""
+        below, settling = self._below(time, state), self._settling
+        first = 3 + 3 * settling.floors.have_friction
+        if contact == settling.end_of_roll and below.brake is not None:
+            heading = below.brake.heading
+            return where(dot(heading, heading) > 0, 1.0, 0.0), first + self.curved
+        assert below.spinning is not None
+        coefficient, sign = below.spinning
+        return where(coefficient > 0, sign, 0.0), first
 
     def _flush(self, contact: Member, time: Any, state: Travel) -> "_Entry":
         """How a ball on a support sees a face that is flush with it: it comes onto it over its edges."""
@@ -214,7 +304,7 @@ class Grounded(AbstractSystem):
         return _Entry(flush, inside, [] if rim is None else [(axis, rim[0], half) for axis, half in rim[1]])
 
     def is_parabolic(self, contact):
-        return self.scene.is_parabolic(contact) if isinstance(contact, Member) else contact == self._end_of_slip
+        return self.scene.is_parabolic(contact) if isinstance(contact, Member) else contact >= self._end_of_slip
 
     def returns(self, contact, time, q, v, half_a, state):
         if not isinstance(contact, Member):
@@ -237,10 +327,22 @@ class Grounded(AbstractSystem):
                 rim = type(bend)(functools.reduce(minimum, low), functools.reduce(maximum, high))
                 bend = type(bend)(*[where(found.flush, a, b) for a, b in zip(rim, bend, strict=True)])
                 skip = skip | found.inside
-        elif contact == self._end_of_slip:
+        elif contact == self._end_of_slip and self._floors.have_friction:
             heading = self._below(time, state).heading
-            bend = window._replace(coefficients=window.coefficients[3:]).along(heading, rolling.NONE).bend
+            bend = window._replace(coefficients=window.coefficients[3:6]).along(heading, rolling.NONE).bend
             skip = dot(heading, heading) == 0
+        elif contact == self._settling.end_of_hold:
+            bend, skip = window.track(window.coefficients[-1]).bend, phase_of(state) < 0
+        elif contact >= self._settling.end_of_roll:
+            sign, k = self._dying(contact, time, state)
+            unit = 1.0 if contact == self._settling.end_of_roll else self.scene.ball.radius
+            low, high = scale(unit, window.track(window.coefficients[k]).bend)
+            bend, skip = Interval(where(sign < 0, -high, low), where(sign < 0, -low, high)), sign == 0
+        elif self.curved:
+            beyond, across, middle, half, present = self._below(time, state).seams[contact - self._n_surfaces]
+            low, high = round_bend(place, (across,), middle, half, False)
+            away = (times(-1.0, high), times(-1.0, low))
+            bend, skip = Interval(*[where(beyond, a, b) for a, b in zip((low, high), away, strict=True)]), ~present
         else:
             across, middle, half, present = self._exit(contact, state, time)
             bend, skip = round_bend(place, (across,), middle, half, True), ~present
@@ -263,8 +365,8 @@ class Grounded(AbstractSystem):
 
     def meets(self, contact, time, state, left, rests, ends):
         settling = self._settling
-        n, struck, stays = self.scene.struck(contact, time, state.flight, settling.support(state))
-        pull = settling.pull(time, struck)
+        n, struck, stays = settling.struck(contact, time, state)
+        pull = settling.pull(time, struck, contact)
         rise, into, e_n = dot(n, struck.velocity), times(-1.0, dot(n, pull)), self.scene.restitution(contact)
         # Not later than `train.duration`, or nearly.
         soon = rests | (times(2.0, rise) <= 1.001 * left * times(into, 1.0 - e_n))
@@ -281,7 +383,7 @@ class Grounded(AbstractSystem):
 
     def after(self, contact, time, state, kind):
         settling = self._settling
-        n, struck, stays = self.scene.struck(contact, time, state.flight, settling.support(state))
+        n, struck, stays = settling.struck(contact, time, state)
 
         def unusual() -> tuple:
             touch = settling.touch(contact, time, state, n, struck, settling.pull(time, struck), stays)
@@ -344,6 +446,6 @@ def _as_arrays(tree: Any, time: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, bool) else number(jnp.asarray(x)), tree)
 
 
-def grounded(scene: Scene, tolerance: float, parabolic: bool) -> Scene | Grounded:
+def grounded(scene: Scene, tolerance: float, parabolic: bool, curved: bool = False) -> Scene | Grounded:
     """A scene with the motion after the last bounce, if there can be a last one."""
-    return Grounded(scene, tolerance, parabolic) if Floors(scene).indices else scene
+    return Grounded(scene, tolerance, parabolic, curved=curved) if Floors(scene, curved).indices else scene

@@ -1,16 +1,12 @@
 """Where a ball may stay after its last bounce, and what happens when it crosses a contact there or comes to rest."""
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from .._impact import AbstractContactLaw, Contact, along_surface, rolling, train
+from .._impact import rolling, train
 from .._math import (
     KINDS,
     RESULTS,
@@ -21,7 +17,7 @@ from .._math import (
     components,
     cross,
     dot,
-    is_constant,
+    maximum,
     minimum,
     norm,
     ratio,
@@ -31,110 +27,8 @@ from .._math import (
     where,
     where_vector,
 )
-from .scene import Flight, Scene
-from .surface import AbstractSurface, Face
-from .system import Meeting, magnitude, rounding
-from .touching import Member, Neighbours, Stack, Support, neighbours, numbers_of as _numbers
-
-
-def _can_settle(surface: AbstractSurface) -> bool:
-    """Whether a ball may roll or slide on a surface after its last bounce, as far as is known when it is traced."""
-    flat = type(surface).face is not AbstractSurface.face
-    elastic = is_constant(surface.law.restitution) and surface.law.restitution == 1
-    return flat and surface.law.rolls is not None and not elastic
-
-
-class Floors:
-    """The surfaces of `scene` to stay on. Where a choice is none of them, what it gets are harmless numbers."""
-
-    def __init__(self, scene: Scene):
-        kinds = [each.first if isinstance(each, Stack) else each for each in scene.surfaces]
-        self.indices = [i for i, surface in enumerate(kinds) if _can_settle(surface)]
-        self._ball, floors = scene.ball, [kinds[i] for i in self.indices]
-        # Whether a ball may slide against friction, so that its slip is followed.
-        self.have_friction = any(surface.law.sliding_friction() is not None for surface in floors)
-        self.have_edges = any(surface.has_edges for surface in floors)
-
-    def include(self, contact: Choice) -> Any:
-        return contact.among(self.indices)
-
-    def _of(self, contact: Choice, function: Callable[[AbstractSurface], Any]) -> Any:
-        return contact.of([function(contact.members[i].surface) for i in self.indices], self.indices)
-
-    def face(self, contact: Choice, x: Vector3, time: Any) -> tuple[Face, Any]:
-        """The face below a ball on that surface, and whether it has edges."""
-        faces: list[Any] = [contact.members[i].surface.face(x, time) for i in self.indices]
-        half = [(1.0, 1.0) if face.half is None else face.half for face in faces]
-        vector = lambda options: contact.vector(options, self.indices)  # noqa: E731
-        below = contact.of([jnp.asarray(face.below) for face in faces], self.indices)
-        tangents = (vector([face.tangents[0] for face in faces]), vector([face.tangents[1] for face in faces]))
-        centers, normals = vector([face.center for face in faces]), vector([face.normal for face in faces])
-        edged = contact.among([i for i, face in zip(self.indices, faces, strict=True) if face.half is not None])
-        return Face(normals, centers, tangents, vector(half), below), edged
-
-    def rolls(self, contact: Choice) -> Any:
-        """Whether a ball rolls on that surface, perhaps after sliding."""
-        return self._of(contact, lambda surface: _rolls(surface.law))
-
-    def friction(self, contact: Choice) -> Number:
-        """The coefficient on that surface; infinite where a ball never slides or never rolls."""
-        return self._of(contact, lambda surface: _friction(surface.law))
-
-    def law(self, contact: Choice) -> Contact:
-        """What trains need of that surface."""
-        return Contact(
-            self._of(contact, lambda surface: surface.law.restitution),
-            self._of(contact, lambda surface: surface.law.reversal()),
-            self.friction(contact) if self.have_friction else None,
-            self.rolls(contact),
-            self._ball.inertia_ratio,
-            self._ball.radius,
-        )
-
-
-def _friction(law: AbstractContactLaw) -> Number:
-    friction = law.sliding_friction()
-    return jnp.inf if friction is None else friction
-
-
-def _rolls(law: AbstractContactLaw) -> Any:
-    return bool(law.rolls) if law.sliding_friction() is None else _friction(law) > 0
-
-
-class Freedom(NamedTuple):
-    """What a support leaves of a ball's motion: with the acceleration a and the normal n, share (a - held (n . a) n);
-    the spin at the velocity v is spin + turning (n x v)."""
-
-    held: Any  # 1 on a face, else 0
-    share: Any  # 1 / (1 + alpha) for a ball that rolls, else 1
-    spin: Vector3
-    turning: Any
-
-
-class Ground(NamedTuple):
-    """What a ball that stays on a face has below it."""
-
-    face: Face
-    edged: Any  # whether it is on a face with edges
-    rolls: Any  # whether it is on a face on which it rolls, perhaps after sliding
-    friction: Number | None  # of that face; infinite where it never slides or never rolls
-    free: Freedom
-    slip: Vector3  # zero of a ball that rolls, and where there is no friction to slide against
-    heading: Vector3  # the direction in which it slides against friction, or zero
-    straight: Any  # whether it keeps that direction until its slip ends
-    flush: Neighbours | None = None  # the faces that are flush with it, if there can be any
-
-
-class Travel(NamedTuple):
-    """A ball's state inside the engine, with the phase that it is in."""
-
-    flight: Flight
-    support: Any  # index of the surface that the ball stays on, -1 in flight; a float, as all of a state is
-    below: Ground | None = None  # only while an arc is worked on
-
-
-def phase_of(state: Travel) -> Any:
-    return jnp.asarray(state.support).astype(jnp.int32)
+from .._world import Face, Flight, Meeting, Member, Neighbours, Support, magnitude, neighbours, numbers_of, rounding
+from .ground import Footing, Travel, phase_of
 
 
 class Touch(NamedTuple):
@@ -156,64 +50,20 @@ class Touch(NamedTuple):
     grips: Any  # whether all of them grip
     on: Any  # whether the ball was on a face before, and is not thrown off it
     onto: Any  # the surface onto which it passes, or -1; `None` where no faces are flush
+    turn: Vector3 | None = None  # how fast the normal of a curved surface turns as the ball goes along
 
 
-class Settling(NamedTuple):
-    """What a ball does that stays on a face of a scene. `tolerance` and `parabolic` are those of `Grounded`."""
-
-    scene: Scene
-    tolerance: float
-    parabolic: bool
-    floors: Floors
-    joins: bool  # whether faces may be flush
-
-    @property
-    def end_of_slip(self) -> int:
-        """The contact at which a slip has died out, behind the surfaces and, where some of them have faces with edges,
-        the two pairs of edges of the face below."""
-        return self.scene.n_contacts + 2 * self.floors.have_edges
-
-    def ground(self, time: Any, state: Travel) -> Ground:
-        flight, floors, on = state.flight, self.floors, state.support >= 0
-        support = self.scene.choice(phase_of(state))
-        face, edged = floors.face(support, flight.position, time)
-        edged, rolls, ball, n = on & edged, on & floors.rolls(support), self.scene.ball, face.normal
-        share = where(rolls, ratio(1.0, 1.0 + ball.inertia_ratio), 1.0)
-        pivot = where_vector(rolls, scale(dot(n, flight.spin), n), flight.spin)
-        free = Freedom(where(on, 1.0, 0.0), share, pivot, where(rolls, ratio(1.0, ball.radius), 0.0))
-        flush = self._flush(time, state, n) if self.joins else None
-        if not floors.have_friction:
-            return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True, flush)
-        friction = floors.friction(support)
-        slides = rolls & jnp.isfinite(friction)
-        slip = rolling.own_slip(ball.radius, n, flight.velocity, flight.spin)
-        slip = where_vector(slides, slip, rolling.NONE)
-        a = self.pull(time, flight)
-        most = where(slides, friction, 0.0) * -dot(a, n) * (1.0 + 1.0 / ball.inertia_ratio)
-        along = rolling.along_surface(n, a)
-        heading = where_vector(slides, rolling.heading(slip, along, most), rolling.NONE)
-        straight = self.parabolic or rolling.stays_straight(heading, slip, along, most, self.tolerance)
-        return Ground(face, edged, rolls, friction, free, slip, heading, straight, flush)
-
-    def _flush(self, time: Any, state: Travel, n: Vector3) -> Neighbours:
-        """The faces that are flush with the one that the ball is on, that itself left out."""
-        found = neighbours(self.scene, time, n, self.scene.ball.radius, state.flight)
-        other = (_numbers(self.scene) != phase_of(state)) & (state.support >= 0)
-        return found._replace(flush=found.flush & other)
+class Settling(Footing):
+    """What a ball does that comes to a surface to stay on, or meets something there."""
 
     def _onto(self, index: Any, found: Neighbours, time: Any) -> Any:
         """The surface onto which a ball passes that comes to the contact of that index, an edge of its support or a
         flush face; or -1."""
-        is_met = found.flush & (_numbers(self.scene) == index)
+        is_met = found.flush & (numbers_of(self.scene) == index)
         reached, least = found.flush & found.holds | is_met, float(jnp.finfo(time.dtype).min)
         best = jnp.argmax(jnp.where(reached, jnp.maximum(found.ahead, least), -jnp.inf)).astype(jnp.int32)
-        over = (index >= self.scene.n_contacts) & (index != self.end_of_slip)
+        over = (index >= self.scene.n_contacts) & (index < self.end_of_slip)
         return where((over | jnp.any(is_met)) & jnp.any(reached), best, np.int32(-1))
-
-    def pull(self, time: Any, flight: Flight) -> Vector3:
-        """Gravity, and what air gives now."""
-        _, a = self.scene.derivative(time, flight, flight.position, flight.velocity)
-        return a
 
     def support(self, state: Travel) -> Support:
         """What the ball stays on, for an impact on something else."""
@@ -231,12 +81,42 @@ class Settling(NamedTuple):
             face, _ = floors.face(self.scene.choice(phase_of(state)), state.flight.position, time)
             onto = self._onto(contact.index, self._flush(time, state, face.normal), time)
             on = on | (onto >= 0)
-        floor = self.scene.choice(where(on, phase_of(state), contact.index))
+        floor, turn = self.scene.choice(where(on, phase_of(state), contact.index)), None
+        is_seam = self._is_seam(contact)
+        if self.curved:
+            x = where_vector(is_seam, self._beyond(time, state.flight), state.flight.position)
+            state, struck = state._replace(flight=state.flight._replace(position=x)), struck._replace(position=x)
+            pull = self.pull(time, struck, floor)
         face, edged = floors.face(floor, state.flight.position, time)
         first = train.start(struck.velocity, struck.spin, face.normal, pull, self.scene.ball.radius)
+        if self.curved:
+            _, turn = floors.turning(floor, struck.position, first.velocity, time)
+            if onto is not None:
+                onto = where(is_seam & (onto < 0) & (first.pull > 0), phase_of(state), onto)
         law = floors.law(floor)
         slips, grips = self._regime(first, law)
-        return Touch(contact, time, state, n, struck, pull, floor, face, edged, first, law, slips, grips, on, onto)
+        return Touch(
+            contact, time, state, n, struck, pull, floor, face, edged, first, law, slips, grips, on, onto, turn
+        )
+
+    def struck(self, contact: Choice, time: Any, state: Travel) -> tuple[Vector3, Flight, Any]:
+        """`Scene.struck`; without an impact at a contact that is no surface."""
+        n, struck, stays = self.scene.struck(contact, time, state.flight, self.support(state))
+        if self.follows_hold:
+            is_exit, free = contact.index >= self.scene.n_contacts, state.flight
+            velocity, spin = (where_vector(is_exit, a, b)
+                              for a, b in ((free.velocity, struck.velocity), (free.spin, struck.spin)))  # fmt: skip
+            struck = struck._replace(velocity=velocity, spin=spin)
+        return n, struck, stays
+
+    def _is_seam(self, contact: Choice) -> Any:
+        return (contact.index >= self.scene.n_contacts) & (contact.index < self.end_of_slip)
+
+    def _beyond(self, time: Any, flight: Flight) -> Vector3:
+        """A place so little further along that the difference is rounding, but surely beyond a seam that is reached."""
+        eps, speed = float(jnp.finfo(time.dtype).eps), norm(flight.velocity)
+        size = magnitude(flight.position) + self.scene.ball.radius
+        return add(flight.position, scale(ratio(128.0 * eps * size, speed), flight.velocity))
 
     def _regime(self, first: train.Start, law: train.Contact) -> tuple[Any, Any]:
         """Whether all impacts of a train slip, and whether all of them grip."""
@@ -256,6 +136,10 @@ class Settling(NamedTuple):
             for across, half in zip(face.tangents, face.half, strict=True):
                 margin = half - abs(dot(across, subtract(x, face.center)))
                 room = minimum(room, where(touch.edged, margin, jnp.inf))
+        for k in range(self.floors.n_seams):
+            across, middle, half, present = self.floors.seam(touch.floor, k)
+            margin = abs(abs(dot(across, subtract(x, middle))) - half)
+            room = minimum(room, where(present, margin, jnp.inf))
 
         flush = None
         if self.joins:
@@ -283,6 +167,10 @@ class Settling(NamedTuple):
             end = train.summed(first, touch.law, touch.slips)
             later = self.pull(touch.time, struck._replace(velocity=end.velocity, spin=end.spin))
             calm = norm(subtract(touch.pull, later)) * lasts_known <= self.tolerance
+        if touch.turn is not None:  # a train is summed on the plane that touches the surface
+            speed = norm(struck.velocity)
+            least = maximum(self.tolerance, 64.0 * float(jnp.finfo(touch.time.dtype).eps) * speed)
+            calm = calm & (norm(touch.turn) * lasts_known * speed <= least)
         if struck.orientation is not None:  # infinitely many rotations have no sum
             calm = False
         return lasts, clear, calm & (touch.slips | touch.grips)
@@ -294,7 +182,9 @@ class Settling(NamedTuple):
 
     def meets(self, touch: Touch, left: Any, rests: Any, ends: Any) -> Meeting:
         contact, on, first, law = touch.contact, touch.on, touch.first, touch.law
-        is_exit, grips = contact.index >= self.scene.n_contacts, contact.index == self.end_of_slip
+        is_exit = contact.index >= self.scene.n_contacts
+        grips = (contact.index == self.end_of_slip) & self.floors.have_friction
+        lifts = (contact.index == self.end_of_hold) if self.follows_hold else False
         is_floor = self.floors.include(contact) & touch.face.below & (first.pull > 0)
         lasts, clear, sums = self._sums(touch)
         capped = law.rolls & jnp.isfinite(jnp.inf if law.friction is None else law.friction)
@@ -307,6 +197,12 @@ class Settling(NamedTuple):
         # Beside a wall a ball lies down where it is: what it goes during its last bounces could take it through.
         bounce_or_end = KINDS.where(dies_out & clear, KINDS.train, KINDS.where(lies, KINDS.rolling, KINDS.bounce))
         over = KINDS.where(grips, KINDS.gripped, KINDS.left)
+        stops: Any = False
+        if any(self.floors.resist):
+            stops = (contact.index >= self.end_of_roll) & (contact.index < self.end_of_hold)
+            over = KINDS.where(stops, KINDS.stopped, over)
+        if self.follows_hold and self.floors.have_friction:
+            over = KINDS.where(jnp.asarray(lifts) & self._begins_to_slip(touch), KINDS.slipped, over)
         kind = KINDS.where(on, KINDS.where(is_exit, over, KINDS.rolling), bounce_or_end)
         passes = touch.onto >= 0 if self.joins else False
         kind = KINDS.where(passes, KINDS.passed, kind) if self.joins else kind
@@ -317,14 +213,52 @@ class Settling(NamedTuple):
         stuck = stuck & ~passes if self.joins else stuck
         fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
         fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
-        tips = on & is_exit & ~grips & self._tips(touch)
+        goes = is_exit & ~grips & ~jnp.asarray(lifts) & ~jnp.asarray(stops)
+        tips = False if self.curved else on & goes & self._tips(touch)
         fault = RESULTS.where(tips & ~passes if self.joins else tips, RESULTS.pivoting, fault)
-        if self.floors.have_friction and self.parabolic:
+        if (self.floors.have_friction or self.floors.resist[0]) and self.parabolic:
             below, pull = self.ground(touch.time, after), self.pull(touch.time, after.flight)
-            straight = rolling.is_straight(below.heading, rolling.along_surface(below.face.normal, pull), norm(pull))
+            along = rolling.along_surface(below.face.normal, pull)
+            straight = rolling.is_straight(below.heading, along, norm(pull))
+            if below.brake is not None:
+                straight = straight & rolling.is_straight(below.brake.heading, along, norm(pull))
             bends = (after.support >= 0) & ~straight
             fault = RESULTS.where(bends, RESULTS.curved_slide, fault)
         return Meeting(kind, fault, after, pause, is_at_rest)
+
+    def _stopped(self, touch: Touch) -> tuple[Vector3, Vector3]:
+        """Velocity and spin of a ball whose rolling, or spinning about the normal, has died out."""
+        flight, n, index = touch.state.flight, touch.face.normal, touch.contact.index
+        velocity, spin = flight.velocity, flight.spin
+        if self.floors.resist[0]:
+            # One that goes aside has only turned by a right angle.
+            small = self.parabolic or norm(velocity) <= 100.0 * self.tolerance
+            stops = (index == self.end_of_roll) & small
+            velocity = where_vector(stops, rolling.NONE, velocity)
+            spin = where_vector(stops, scale(dot(n, spin), n), spin)
+        if self.end_of_hold > self.end_of_spin:
+            without = subtract(spin, scale(dot(n, spin), n))
+            spin = where_vector(index == self.end_of_spin, without, spin)
+        return velocity, spin
+
+    def _begins_to_slip(self, touch: Touch) -> Any:
+        """Whether the surface still pushes a ball that it cannot make roll any more."""
+        flight, eps = touch.state.flight, float(jnp.finfo(touch.time.dtype).eps)
+        size = norm(touch.pull) + norm(self.pull(touch.time, flight))
+        slip = rolling.own_slip(self.scene.ball.radius, touch.face.normal, flight.velocity, flight.spin)
+        limited = touch.law.rolls & jnp.isfinite(jnp.inf if touch.law.friction is None else touch.law.friction)
+        return limited & (norm(slip) == 0) & (touch.first.pull > eps**0.5 * size)
+
+    def _slipping(self, touch: Touch) -> tuple[Vector3, Vector3]:
+        """Velocity and spin of a ball that begins to slip: a little, so that rounding does not hide the direction."""
+        flight, ball, n = touch.state.flight, self.scene.ball, touch.face.normal
+        eps = float(jnp.finfo(touch.time.dtype).eps)
+        drive = rolling.along_surface(n, touch.pull)
+        if touch.turn is not None:
+            drive = subtract(drive, rolling.twist(ball.radius, dot(n, flight.spin), n, touch.turn))
+        size = eps**0.75 * (norm(flight.velocity) + ball.radius * norm(flight.spin))
+        slip = scale(ratio(size, norm(drive)), drive)
+        return flight.velocity, rolling.rolling_spin(ball.radius, n, subtract(flight.velocity, slip), flight.spin)
 
     def _tips(self, touch: Touch) -> Any:
         """Whether a ball that comes to an edge is too slow to fly off: v^2 < g_n r, v across the edge."""
@@ -347,6 +281,14 @@ class Settling(NamedTuple):
             ball = self.scene.ball
             velocity, spin = rolling.gripped(ball.radius, ball.inertia_ratio, n, flight.velocity, flight.spin)
             kept = where_vector(grips, velocity, kept[0]), where_vector(grips, spin, kept[1])
+            if self.follows_hold:
+                slips = kind == KINDS.slipped
+                kept = [where_vector(slips, a, b) for a, b in zip(self._slipping(touch), kept, strict=True)]
+                stays = stays | (on & slips)
+        if any(self.floors.resist):
+            stops = kind == KINDS.stopped
+            kept = [where_vector(stops, a, b) for a, b in zip(self._stopped(touch), kept, strict=True)]
+            stays = stays | (on & stops)
         held, pull = self._held(touch)
         wedged = self._is_wedged(touch, held, pull)
         kept = [where_vector(wedged, rolling.NONE, x) for x in kept]
@@ -364,6 +306,8 @@ class Settling(NamedTuple):
             passed, onto = kind == KINDS.passed, touch.onto
             support = where(passed, onto.astype(support.dtype), support)
             after = self._passed(passed, onto, touch, after)
+        if self.curved:
+            after = self.placed(touch.time, support, after)
         at_rest = (settles | stays) & self._is_still(touch, after, held)
         return Travel(after, support), where(settles, end.time, 0.0), wedged, at_rest
 
@@ -382,9 +326,17 @@ class Settling(NamedTuple):
         """Whether nothing moves any more, nor will."""
         eps = float(jnp.finfo(touch.time.dtype).eps)
         size: Callable = lambda flight: norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)  # noqa: E731
-        along = rolling.along_surface(touch.face.normal, components(self.scene.gravity))
-        is_level = (norm(along) <= 64.0 * eps * norm(components(self.scene.gravity))) & (self.scene.air is None)
-        return (size(after) <= 64.0 * eps * size(touch.state.flight)) & (is_level | held)
+        g = components(self.scene.gravity)
+        along, least = rolling.along_surface(touch.face.normal, g), 64.0 * eps * norm(g)
+        if self.floors.resist[0]:
+            share = 1.0 + self.scene.ball.inertia_ratio
+            holds = share * self.floors.resistance(touch.floor, 0) * -dot(touch.face.normal, g)
+            least = maximum(least, where(touch.law.rolls, holds, 0.0))
+        is_level = (norm(along) <= least) & (self.scene.air is None)
+        before = size(touch.state.flight)
+        if self.floors.resist[0]:  # what is left of a stop that is found by steps is small already
+            before = maximum(before, jnp.sqrt(self.scene.ball.radius * norm(g)))
+        return (size(after) <= 64.0 * eps * before) & (is_level | held)
 
     def _held(self, touch: Touch) -> tuple[Any, Number]:
         """Whether gravity holds a ball on its support against another surface, into that surface and not along the
@@ -419,28 +371,3 @@ class Settling(NamedTuple):
         spin = where_vector(law.rolls, last.spin, struck.spin)
         velocity = add(velocity, scale(since, touch.pull))
         return Travel(struck._replace(position=position, velocity=velocity, spin=spin), -1.0)
-
-
-def slides_across(scene: Scene) -> bool:
-    """Whether a ball is known now, not only when the program runs, to meet a slope that it may slide across."""
-    if any(isinstance(leaf, jax.core.Tracer) or np.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
-        return False
-    # As numbers of Python, on which every operation of JAX would be a program of its own to compile.
-    known = functools.partial(jax.tree.map, lambda x: float(x) if eqx.is_inexact_array(x) and x.ndim == 0 else x)
-    if all(known(surface.law).sliding_friction() is None for surface in scene.surfaces):
-        return False
-    scene = known(scene)
-    with jax.ensure_compile_time_eval():  # known numbers, also within a transformation
-        return _meets_slope(scene)
-
-
-def _meets_slope(scene: Scene) -> bool:
-    g = components(scene.gravity)
-    above = scale(ratio(-1e6, norm(g)), g)
-    for surface in scene.surfaces:
-        face = surface.face(above, 0.0) if _can_settle(surface) else None
-        if face is not None and surface.law.sliding_friction() is not None:
-            steep = norm(along_surface(face.normal, g)) > 1e-6 * norm(g)
-            if bool(steep) and bool(dot(face.normal, g) < 0):
-                return True
-    return False

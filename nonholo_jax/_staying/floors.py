@@ -1,0 +1,138 @@
+"""The surfaces of a scene that a ball may stay on."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .._impact import AbstractContactLaw, Contact
+from .._math import Choice, Number, Vector3, is_constant, ratio, slope
+from .._world import AbstractSurface, Face, Stack
+
+
+def can_settle(surface: AbstractSurface, curved: bool = False) -> bool:
+    """Whether a ball may roll or slide on a surface after its last bounce, as far as is known when it is traced; if
+    not `curved`, on a flat one only."""
+    if curved:
+        return surface.law.rolls is not None
+    flat = type(surface).face is not AbstractSurface.face
+    return flat and surface.law.rolls is not None and not is_elastic(surface)
+
+
+def is_elastic(surface: AbstractSurface) -> bool:
+    """Whether bounces on a surface are known never to die out."""
+    return is_constant(surface.law.restitution) and bool(surface.law.restitution == 1)
+
+
+class Floors:
+    """The surfaces of `scene` to stay on: if `curved`, of any shape, each seen as the plane that touches it below the
+    ball. Where a choice is none of them, what it gets are harmless numbers."""
+
+    def __init__(self, scene: Any, curved: bool = False):
+        kinds = [each.first if isinstance(each, Stack) else each for each in scene.surfaces]
+        self.curved = curved
+        self.indices = [i for i, surface in enumerate(kinds) if can_settle(surface, curved)]
+        self._ball, floors = scene.ball, [kinds[i] for i in self.indices]
+        # Whether a ball may slide against friction, so that its slip is followed.
+        self.have_friction = any(surface.law.sliding_friction() is not None for surface in floors)
+        self.have_edges = not curved and any(surface.has_edges for surface in floors)
+        resistance = [surface.law.resistance() for surface in floors]
+        # Whether anything resists rolling, and spinning about the normal, on any of them.
+        self.resist = tuple(
+            any(not (is_constant(c) and c == 0) for c in each) for each in zip(*resistance, strict=True)
+        )
+        self.resist = self.resist or (False, False)
+        self.n_seams = max([len(surface.seams()) for surface in floors], default=0) if curved else 0
+
+    def include(self, contact: Choice) -> Any:
+        return contact.among(self.indices)
+
+    def _of(self, contact: Choice, function: Callable[[AbstractSurface], Any]) -> Any:
+        return contact.of([function(contact.members[i].surface) for i in self.indices], self.indices)
+
+    def face(self, contact: Choice, x: Vector3, time: Any) -> tuple[Face, Any]:
+        """The face below a ball on that surface, and whether it has edges."""
+        if self.curved:
+            n = self._vector(contact, lambda surface: surface.direction(x, time))
+            still = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            return Face(n, x, still, None, True), False
+        faces: list[Any] = [contact.members[i].surface.face(x, time) for i in self.indices]
+        half = [(1.0, 1.0) if face.half is None else face.half for face in faces]
+        vector = lambda options: contact.vector(options, self.indices)  # noqa: E731
+        below = contact.of([jnp.asarray(face.below) for face in faces], self.indices)
+        tangents = (vector([face.tangents[0] for face in faces]), vector([face.tangents[1] for face in faces]))
+        centers, normals = vector([face.center for face in faces]), vector([face.normal for face in faces])
+        edged = contact.among([i for i, face in zip(self.indices, faces, strict=True) if face.half is not None])
+        return Face(normals, centers, tangents, vector(half), below), edged
+
+    def _vector(self, contact: Choice, function: Callable[[AbstractSurface], Any]) -> Vector3:
+        return contact.vector([function(contact.members[i].surface) for i in self.indices], self.indices)
+
+    def turning(
+        self, contact: Choice, x: Vector3, v: Vector3, time: Any, beyond: Sequence | None = None
+    ) -> tuple[Vector3, Vector3]:
+        """The normal below a ball on that surface, and how fast it turns as the ball goes along; if it is known which
+        seams it is `beyond`, of that part of the surface."""
+
+        def normal(*x: Any) -> tuple:
+            def direction(surface: AbstractSurface) -> Any:
+                if beyond is None:
+                    return surface.direction(x, time)  # pyright: ignore
+                return surface.direction_within(x, time, beyond[: len(surface.seams())])  # pyright: ignore
+
+            n = self._vector(contact, direction)
+            return tuple(jnp.asarray(c, time.dtype) for c in n)
+
+        arrays = [tuple(jnp.asarray(c, time.dtype) for c in each) for each in (x, v)]
+        return jax.jvp(normal, *arrays)  # pyright: ignore
+
+    def depth(self, contact: Choice, x: Vector3, n: Vector3, time: Any) -> Number:
+        """How far a ball is off that surface, to first order, along the normal there."""
+
+        def level(x: Any) -> Any:
+            return self._of(contact, lambda surface: surface.level(x, time, self._ball.radius))
+
+        value, rate = slope(level, x, n)
+        return ratio(value, rate)
+
+    def seam(self, contact: Choice, k: int) -> tuple[Vector3, Vector3, Number, Any]:
+        """Pair number k of the planes across which that surface bends otherwise: across, the middle, half the distance
+        between them, and whether there is such a pair."""
+        found = [(i, contact.members[i].surface.seams()) for i in self.indices]
+        rows = [(i, seams[k]) for i, seams in found if len(seams) > k]
+        numbers = [i for i, _ in rows]
+        across, middle = (contact.vector([row[part] for _, row in rows], numbers) for part in (0, 1))
+        return across, middle, contact.of([row[2] for _, row in rows], numbers), contact.among(numbers)
+
+    def rolls(self, contact: Choice) -> Any:
+        """Whether a ball rolls on that surface, perhaps after sliding."""
+        return self._of(contact, lambda surface: _rolls(surface.law))
+
+    def friction(self, contact: Choice) -> Number:
+        """The coefficient on that surface; infinite where a ball never slides or never rolls."""
+        return self._of(contact, lambda surface: _friction(surface.law))
+
+    def resistance(self, contact: Choice, which: int) -> Number:
+        """The coefficient of rolling resistance on that surface (0), or of spinning friction (1)."""
+        return self._of(contact, lambda surface: surface.law.resistance()[which])
+
+    def law(self, contact: Choice) -> Contact:
+        """What trains need of that surface."""
+        return Contact(
+            self._of(contact, lambda surface: surface.law.restitution),
+            self._of(contact, lambda surface: surface.law.reversal()),
+            self.friction(contact) if self.have_friction else None,
+            self.rolls(contact),
+            self._ball.inertia_ratio,
+            self._ball.radius,
+        )
+
+
+def _friction(law: AbstractContactLaw) -> Number:
+    friction = law.sliding_friction()
+    return jnp.inf if friction is None else friction
+
+
+def _rolls(law: AbstractContactLaw) -> Any:
+    return bool(law.rolls) if law.sliding_friction() is None else _friction(law) > 0

@@ -1,0 +1,329 @@
+"""What is below a ball that stays on a surface, which way it is driven there, and what resists it."""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+
+from .._impact import AbstractContactLaw, along_surface, rolling
+from .._math import (
+    Choice,
+    Number,
+    Vector3,
+    add,
+    components,
+    cross,
+    dot,
+    norm,
+    plus,
+    ratio,
+    scale,
+    subtract,
+    where,
+    where_vector,
+)
+from .._world import AbstractSurface, Face, Flight, Neighbours, Scene, neighbours, numbers_of
+from .floors import Floors, can_settle, is_elastic
+
+_UP = (0.0, 0.0, 1.0)
+
+
+class Freedom(NamedTuple):
+    """What a support leaves of a ball's motion: with the acceleration a and the normal n, share (a - held (n . a) n);
+    the spin at the velocity v is spin + turning (n x v)."""
+
+    held: Any  # 1 on a face, else 0
+    share: Any  # 1 / (1 + alpha) for a ball that rolls, else 1
+    spin: Vector3
+    turning: Any
+
+
+class Brake(NamedTuple):
+    """What resists a ball that rolls."""
+
+    coefficient: Number  # zero of one that slips
+    heading: Vector3  # in which it rolls, or begins to; zero where resistance holds it
+    straight: Any  # whether it keeps that direction until it stops
+    holds: Any  # whether resistance holds it
+
+
+class Ground(NamedTuple):
+    """What a ball that stays on a face has below it."""
+
+    face: Face
+    edged: Any  # whether it is on a face with edges
+    rolls: Any  # whether it is on a face on which it rolls, perhaps after sliding
+    friction: Number | None  # of that face; infinite where it never slides or never rolls
+    free: Freedom
+    slip: Vector3  # zero of a ball that rolls, and where there is no friction to slide against
+    heading: Vector3  # the direction in which it slides against friction, or zero
+    straight: Any  # whether it keeps that direction until its slip ends
+    flush: Neighbours | None = None  # the faces that are flush with it, if there can be any
+    pivot: Number = 0.0  # the spin about the normal of a ball that rolls on a curved surface
+    seams: tuple = ()  # for each pair of seams whether the ball is beyond it, and what `Floors.seam` says
+    brake: Brake | None = None  # `None` where nothing resists rolling
+    spinning: tuple | None = None  # the coefficient of what resists spinning about the normal, and against which sign
+
+
+class Travel(NamedTuple):
+    """A ball's state inside the engine, with the phase that it is in."""
+
+    flight: Flight
+    support: Any  # index of the surface that the ball stays on, -1 in flight; a float, as all of a state is
+    below: Ground | None = None  # only while an arc is worked on
+
+
+def phase_of(state: Travel) -> Any:
+    return jnp.asarray(state.support).astype(jnp.int32)
+
+
+class Forced(NamedTuple):
+    """What drives a ball that stays on a surface: accelerations."""
+
+    normal: Vector3
+    turn: Vector3  # how fast the normal turns
+    push: Number  # what the surface must take away along the normal: negative where it pushes
+    along: Vector3  # of gravity and air, along the surface
+    twist: Vector3  # `rolling.twist`, of a ball that rolls
+
+
+class Footing:
+    """What a ball has below it that stays on a surface of a scene. `tolerance` and `parabolic` are those of `Grounded`;
+    `joins` says that faces may be flush, or that a surface has parts that bend differently."""
+
+    def __init__(self, scene: Scene, tolerance: float, parabolic: bool, floors: Floors, joins: bool):
+        self.scene, self.tolerance, self.parabolic = scene, tolerance, parabolic
+        self.floors, self.joins = floors, joins
+
+    @property
+    def curved(self) -> bool:
+        return self.floors.curved
+
+    @property
+    def n_edges(self) -> int:
+        """How many contacts, behind the surfaces, are pairs of edges of the face below, or of seams of the surface."""
+        return self.floors.n_seams + 2 * self.floors.have_edges
+
+    @property
+    def end_of_slip(self) -> int:
+        """The contact at which a slip has died out."""
+        return self.scene.n_contacts + self.n_edges
+
+    @property
+    def end_of_roll(self) -> int:
+        """The contact at which resistance has stopped a ball that rolled."""
+        return self.end_of_slip + self.floors.have_friction
+
+    @property
+    def end_of_spin(self) -> int:
+        """The contact at which spinning about the normal has died out, where that is followed step by step."""
+        return self.end_of_roll + self.floors.resist[0]
+
+    @property
+    def end_of_hold(self) -> int:
+        """The contact at which the surface would have to pull the ball, or to grip it more than friction can."""
+        return self.end_of_spin + (self.floors.resist[1] and self.curved)
+
+    @property
+    def follows_hold(self) -> bool:
+        """Whether what holds a ball on a surface may end while nothing else happens."""
+        return self.curved or (self.scene.air is not None and bool(self.floors.indices))
+
+    def ground(self, time: Any, state: Travel) -> Ground:
+        flight, floors, on = state.flight, self.floors, state.support >= 0
+        support = self.scene.choice(phase_of(state))
+        face, edged = floors.face(support, flight.position, time)
+        if self.curved:  # in flight there may be no normal
+            face = face._replace(normal=where_vector(on, face.normal, _UP))
+        edged, rolls, ball, n = on & edged, on & floors.rolls(support), self.scene.ball, face.normal
+        share = where(rolls, ratio(1.0, 1.0 + ball.inertia_ratio), 1.0)
+        pivot = where_vector(rolls, scale(dot(n, flight.spin), n), flight.spin)
+        free = Freedom(where(on, 1.0, 0.0), share, pivot, where(rolls, ratio(1.0, ball.radius), 0.0))
+        flush = self._flush(time, state, n) if self.joins else None
+        more = self._curved_ground(support, flight, n, on, rolls) if self.curved else {}
+        if not (floors.have_friction or any(floors.resist)):
+            return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True, flush, **more)
+        a = self.pull(time, flight)
+        along, alpha, twist = rolling.along_surface(n, a), ball.inertia_ratio, rolling.NONE
+        if self.curved:
+            turn = where_vector(on, floors.turning(support, flight.position, flight.velocity, time)[1], rolling.NONE)
+            twist = rolling.twist(ball.radius, more["pivot"], n, turn)
+            a = add(a, scale(dot(turn, flight.velocity), n))
+            if floors.resist[1]:
+                more["spinning"] = self._spinning(support, flight, n, turn, -dot(a, n), rolls)
+        elif floors.resist[1]:
+            more["spinning"] = where(rolls, floors.resistance(support, 1), 0.0), jnp.sign(dot(n, flight.spin))
+        push, brake, slowed = -dot(a, n), None, rolling.NONE
+        if floors.resist[0]:
+            brake, slowed = self._brake(support, flight, n, push, add(along, scale(alpha, twist)), rolls)
+        if not floors.have_friction:
+            return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True, flush, brake=brake, **more)
+        friction = floors.friction(support)
+        slides = rolls & jnp.isfinite(friction)
+        slip = rolling.own_slip(ball.radius, n, flight.velocity, flight.spin)
+        slip = where_vector(slides, slip, rolling.NONE)
+        drive = subtract(along, twist)
+        if brake is not None:
+            drive = add(drive, scale(where(dot(slip, slip) > 0, 0.0, 1.0 + 1.0 / alpha), slowed))
+        most = where(slides, friction, 0.0) * push * (1.0 + 1.0 / alpha)
+        heading = where_vector(slides, rolling.heading(slip, drive, most), rolling.NONE)
+        straight = self.parabolic or rolling.stays_straight(heading, slip, drive, most, self.tolerance)
+        if brake is not None:
+            slides = dot(heading, heading) > 0
+            brake = brake._replace(coefficient=where(slides, 0.0, brake.coefficient), holds=brake.holds & ~slides,
+                                   heading=where_vector(slides, rolling.NONE, brake.heading))  # fmt: skip
+        return Ground(face, edged, rolls, friction, free, slip, heading, straight, flush, brake=brake, **more)
+
+    def _brake(
+        self, support: Choice, flight: Flight, n: Vector3, push: Number, along: Vector3, rolls: Any
+    ) -> tuple[Brake, Vector3]:
+        """What resists a ball that rolls, `along` being what drives it; and by how much that slows it."""
+        share, velocity = ratio(1.0, 1.0 + self.scene.ball.inertia_ratio), rolling.along_surface(n, flight.velocity)
+        coefficient = where(rolls, self.floors.resistance(support, 0), 0.0)
+        most = coefficient * push
+        heading, driven = rolling.heading(velocity, scale(share, along), most), scale(share, along)
+        stands = (dot(heading, heading) == 0) & rolls & (coefficient > 0)
+        heading = where_vector(coefficient > 0, heading, rolling.NONE)
+        straight = self.parabolic or rolling.stays_straight(heading, velocity, driven, most, self.tolerance)
+        return Brake(coefficient, heading, straight, stands), where_vector(stands, driven, scale(most, heading))
+
+    def _spinning(
+        self, support: Choice, flight: Flight, n: Vector3, turn: Vector3, push: Number, rolls: Any
+    ) -> tuple[Number, Number]:
+        """What resists spinning about the normal, and the sign that it acts against, zero where it holds."""
+        coefficient, pivot = where(rolls, self.floors.resistance(support, 1), 0.0), dot(n, flight.spin)
+        eps = float(jnp.finfo(jnp.result_type(*flight.spin)).eps)
+        pivot = where(abs(pivot) > 8.0 * eps * norm(flight.spin), pivot, 0.0)
+        driven, most = dot(flight.spin, turn), rolling.spin_loss(self.scene.ball, coefficient, push)
+        begins = where(abs(driven) > most, jnp.sign(driven), 0.0)
+        return coefficient, where(pivot != 0, jnp.sign(pivot), begins)
+
+    def _curved_ground(self, support: Choice, flight: Flight, n: Vector3, on: Any, rolls: Any) -> dict[str, Any]:
+        pivot = where(rolls, dot(n, flight.spin), 0.0)
+        seams = []
+        for k in range(self.floors.n_seams):
+            across, middle, half, present = self.floors.seam(support, k)
+            beyond = abs(dot(across, subtract(flight.position, middle))) > half
+            seams.append((beyond, across, middle, half, on & present))
+        return {"pivot": pivot, "seams": tuple(seams)}
+
+    def placed(self, time: Any, support: Any, flight: Flight) -> Flight:
+        """The ball exactly on the curved surface that it stays on, going along it."""
+        floor, x = self.scene.choice(jnp.asarray(support).astype(jnp.int32)), flight.position
+        face, _ = self.floors.face(floor, x, time)
+        n, depth = face.normal, self.floors.depth(floor, x, face.normal, time)
+        x = subtract(x, scale(depth, n))
+        velocity = rolling.along_surface(n, flight.velocity)
+        on = support >= 0
+        return flight._replace(
+            position=where_vector(on, x, flight.position), velocity=where_vector(on, velocity, flight.velocity)
+        )
+
+    def pull(self, time: Any, flight: Flight, floor: Choice | None = None) -> Vector3:
+        """Gravity, and what air gives now; with a `floor`, and what its curvature takes to follow it."""
+        _, a = self.scene.derivative(time, flight, flight.position, flight.velocity)
+        if floor is None or not self.curved:
+            return a
+        n, _ = self.floors.turning(floor, flight.position, flight.velocity, time)
+        along = rolling.along_surface(n, flight.velocity)
+        _, turn = self.floors.turning(floor, flight.position, along, time)
+        return add(a, scale(dot(turn, along), n))
+
+    def _flush(self, time: Any, state: Travel, n: Vector3) -> Neighbours:
+        """The faces that are flush with the one that the ball is on, that itself left out."""
+        found = neighbours(self.scene, time, n, self.scene.ball.radius, state.flight)
+        other = (numbers_of(self.scene) != phase_of(state)) & (state.support >= 0)
+        return found._replace(flush=found.flush & other)
+
+    def inner(self, q: tuple) -> tuple[tuple, Number]:
+        """Of a configuration the slip, or nothing where it is not followed, and the spin about the normal."""
+        slip = q[3:6] if self.floors.have_friction else ()
+        return slip, q[3 + len(slip)] if self.curved else 0.0
+
+    def forced(self, time: Any, state: Travel, below: Ground, q: tuple, v: tuple) -> Forced:
+        flight, free, (slip, pivot) = state.flight, below.free, self.inner(q)
+        n, x, turn = below.face.normal, q[:3], rolling.NONE
+        still = free.spin
+        if self.curved:
+            on, floor = phase_of(state) >= 0, self.scene.choice(phase_of(state))
+            n, turn = self.floors.turning(floor, x, v, time, [seam[0] for seam in below.seams])
+            n, turn = where_vector(on, n, _UP), where_vector(on, turn, rolling.NONE)
+            still = where_vector(below.rolls, scale(pivot, n), free.spin)
+        if self.scene.air is not None:  # a ball that rolls turns as it goes
+            turning = subtract(v, slip) if slip else v
+            flight = flight._replace(spin=add(still, scale(free.turning, cross(n, turning))))
+        _, a = self.scene.derivative(time, flight, x, v)
+        into = dot(n, a)
+        along = subtract(a, scale(free.held * into, n))
+        if not self.curved:
+            return Forced(n, turn, into, along, rolling.NONE)
+        twist = rolling.twist(self.scene.ball.radius, pivot, n, turn)
+        return Forced(n, turn, plus(into, dot(turn, v)), along, where_vector(below.rolls, twist, rolling.NONE))
+
+    def braked(self, below: Ground, forced: Forced, v: tuple) -> Vector3:
+        """By how much resistance slows a ball that rolls."""
+        brake = below.brake
+        assert brake is not None
+        share, heading = ratio(1.0, 1.0 + self.scene.ball.inertia_ratio), brake.heading
+        if not self.parabolic:
+            heading = where_vector(brake.straight, heading, rolling.later_heading(v, heading))
+        against = scale(brake.coefficient * -forced.push, heading)
+        driven = scale(share, add(forced.along, scale(self.scene.ball.inertia_ratio, forced.twist)))
+        return where_vector(brake.holds, driven, against)
+
+    def slip_rate(self, below: Ground, slip: Vector3, along: Vector3, push: Number) -> Vector3:
+        """The rate of the slip, zero for a ball that does not slide against friction."""
+        slides, heading = dot(below.heading, below.heading) > 0, below.heading
+        assert below.friction is not None
+        most = where(slides, below.friction, 0.0) * -push
+        most = most * (1.0 + 1.0 / self.scene.ball.inertia_ratio)
+        rate = scale(dot(along, heading) - most, heading)
+        if not self.parabolic:
+            turning = subtract(along, scale(most, rolling.later_heading(slip, heading)))
+            rate = where_vector(below.straight, rate, turning)
+        return where_vector(slides, rate, rolling.NONE)
+
+
+def stays_curved(scene: Scene, edges: bool | None) -> bool:
+    """Whether a ball is to be followed where it stays on a surface that is not flat; `edges` is that of `Integrated`.
+    From the outside of spheres and cylinders it soon rolls off, so that only those that hold it count here."""
+    if edges is not None:
+        return edges
+    if scene.air is not None and Floors(scene).resist[1]:
+        return True
+    hollow = [each for each in scene.surfaces if type(each).face is AbstractSurface.face and getattr(each, "inside", 1)]
+    return any(can_settle(each, curved=True) and not is_elastic(each) for each in hollow)
+
+
+def slides_across(scene: Scene) -> bool:
+    """Whether a ball is known now, not only when the program runs, to meet a slope that it may slide across."""
+    if any(isinstance(leaf, jax.core.Tracer) or np.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
+        return False
+    # As numbers of Python, on which every operation of JAX would be a program of its own to compile.
+    known = functools.partial(jax.tree.map, lambda x: float(x) if eqx.is_inexact_array(x) and x.ndim == 0 else x)
+    if not any(_may_bend(known(surface.law)) for surface in scene.surfaces):
+        return False
+    scene = known(scene)
+    with jax.ensure_compile_time_eval():  # known numbers, also within a transformation
+        return _meets_slope(scene)
+
+
+def _may_bend(law: AbstractContactLaw) -> bool:
+    """Whether a ball on a slope is slowed against its direction, so that its path there is no parabola."""
+    return law.sliding_friction() is not None or bool(law.resistance()[0] != 0)
+
+
+def _meets_slope(scene: Scene) -> bool:
+    g = components(scene.gravity)
+    above = scale(ratio(-1e6, norm(g)), g)
+    for surface in scene.surfaces:
+        face = surface.face(above, 0.0) if can_settle(surface) else None
+        if face is not None and _may_bend(surface.law):
+            steep = norm(along_surface(face.normal, g)) > 1e-6 * norm(g)
+            if bool(steep) and bool(dot(face.normal, g) < 0):
+                return True
+    return False
