@@ -216,12 +216,15 @@ def _simulate(document: Document, scene: Scene) -> SimulateTask | None:
     if table is None:
         return None
     motion = Exact() if table.motion == "exact" else None
-    if motion is not None and scene.air is not None:
+    if table.contact:
+        motion = Exact(contact=Integrated()) if scene.air is None else Integrated(edges=True)
+    if table.motion == "exact" and scene.air is not None:
         what = "`simulate.motion` must be 'integrated' where the scene has air, but got 'exact'"
         raise SceneError(f"{what}; change or remove the line")
     if table.motion == "integrated":
         named = {name: getattr(table, name) for name in ("rtol", "atol", "dt0", "max_steps")}
         options = {name: value for name, value in named.items() if value is not None}
+        options |= {"edges": True} if table.contact else {}
         if table.solver is not None:
             options["solver"] = _solver(table.solver)
         try:
@@ -352,14 +355,15 @@ def _tables(file: SceneFile) -> dict[str, Any]:
 def _motion_fields(motion: Any) -> dict[str, Any]:
     if motion is None:
         return {}
-    if type(motion) is Exact:
-        return {"motion": "exact"}
-    if type(motion) is Integrated and motion.stepsize_controller is None:
+    if type(motion) is Exact and motion.contact in (None, Integrated()):
+        return {"motion": "exact"} | ({} if motion.contact is None else {"contact": True})
+    if type(motion) is Integrated and motion.stepsize_controller is None and motion.edges is not False:
         solver = {"motion": "integrated", "solver": type(motion.solver).__name__}
+        solver |= {"contact": True} if motion.edges else {}
         return solver | _given(motion, ("rtol", "atol", "dt0", "max_steps"))
     raise SceneError(
-        f"`simulate.motion` must be Exact() or Integrated() without a controller in a scene file, but got "
-        f"{type(motion).__name__}; set rtol and atol instead"
+        f"`simulate.motion` must be Exact(), Exact(contact=Integrated()) or Integrated() without a controller in a "
+        f"scene file, but got {motion!r}; set rtol and atol instead"
     )
 
 

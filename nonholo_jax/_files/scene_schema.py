@@ -132,6 +132,7 @@ class SimulateTable(Table):
     max_impacts: Annotated[int, Field(ge=0, le=1_000_000)] = 64
     sum_trains: bool = True
     motion: Literal["exact", "integrated"] | None = None
+    contact: bool = False
     solver: str | None = None
     rtol: Positive | None = None
     atol: Positive | None = None
@@ -228,6 +229,7 @@ _EXAMPLES = {
     "max_impacts": "max_impacts = 16",
     "sum_trains": "sum_trains = true (false gives every bounce)",
     "motion": 'motion = "integrated"',
+    "contact": "contact = true (a ball that stays on a surface is followed over curves, edges and corners)",
     "solver": 'solver = "Tsit5"',
     "rtol": "rtol = 1e-8",
     "atol": "atol = 1e-8",
