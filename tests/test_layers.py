@@ -27,7 +27,7 @@ ROOMS = {
         "tiles",
         "tangents",
     ],
-    "_impact": ["projector", "law", "together", "train", "rolling"],
+    "_impact": ["projector", "law", "together", "train", "rolling", "groove"],
     "_world": [
         "ball",
         "surface",

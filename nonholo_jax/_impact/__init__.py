@@ -1,6 +1,7 @@
 """What an impact does to velocities: the projector, contact laws, corners, trains of bounces, rolling and sliding."""
 
 from . import rolling as rolling, train as train
+from .groove import Sides as Sides
 from .law import AbstractContactLaw as AbstractContactLaw, Frictional as Frictional, Rough as Rough, Smooth as Smooth
 from .projector import (
     accelerate as accelerate,

@@ -117,4 +117,7 @@ class KINDS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
         "otherwise, without an impact."
     )
     stopped = "Rolling resistance, or spinning friction, has stopped what it acts against, without an impact."
+    groove = (
+        "The last of the bounces on a second surface: the ball goes on along the groove between two, or rests there."
+    )
     slipped = "A ball that rolled begins to slip, as friction cannot hold it any more, without an impact."

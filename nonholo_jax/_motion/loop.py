@@ -297,7 +297,7 @@ def turn(
     struck = crossed & ~stopped
     until, settled = time + met.pause, struck & met.is_at_rest
     row, kind = Row(time, until, since, arrived, after), jnp.asarray(met.kind._value, dtype=jnp.int32)
-    log = _written(c.log, c.n_impacts, struck, pack_row(row), jnp.stack([name, kind, system.phase(after)]))
+    log = _written(c.log, c.n_impacts, struck, pack_row(row), jnp.stack([name, kind, system.code(after)]))
     sizes = where(last, jnp.inf, length), s, c.ahead
     path = _followed(c, ended, sizes, found.contact, kind, Flags(c.jumped, struck, reached))
 

@@ -25,7 +25,8 @@ class ImpactLog(eqx.Module):
     - `surface`: index in the order of the scene (of its barriers, for a `LagrangianSystem`).
     - `point` of contact in m, and unit `normal` from the surface to the ball.
     - `before`, `after`: the state on either side of the impact; the positions are equal.
-    - `kind`: one of `KINDS`; `support`: index of the surface that the ball stays on afterwards, -1 if it flies.
+    - `kind`: one of `KINDS`; `support`: index of the surface that the ball stays on afterwards, -1 if it flies;
+        `beside`: of a ball in a groove that of the second one, else -1.
     - `grazing`: True where the closing speed is below sqrt(eps) of the speed: the time of such an impact, and its
         derivatives, are those of the branch taken, and ill-conditioned.
     """
@@ -40,6 +41,7 @@ class ImpactLog(eqx.Module):
     after: Any
     kind: KINDS
     support: Int[Array, "*batch log"]
+    beside: Int[Array, "*batch log"]
     grazing: Bool[Array, "*batch log"]
 
 
@@ -114,7 +116,7 @@ def _at_one(trajectory: Trajectory, t: Any) -> Any:
         row = jnp.maximum(past - 1, 0)
         start = jax.tree.map(lambda a, b: jnp.where(past > 0, a[row], b), log.after, start)
         begin = jnp.where(past > 0, log.until[row], begin)
-        phase = jnp.where(past > 0, log.support[row], phase)
+        phase = jnp.where(past > 0, system.code_of(log.support[row], log.beside[row]), phase)
         end = jnp.where(trajectory.n_rows > rows, log.until[rows - 1], end)
     else:
         end = jnp.where(trajectory.n_rows > 0, trajectory.t0, end)
@@ -170,7 +172,8 @@ def packaged(system: AbstractSystem, motion: AbstractMotion, state: Any, t0: Any
 
 def _log(system: AbstractSystem, t0: Any, outcome: Outcome) -> ImpactLog:
     values = outcome.log.values
-    contact, code, support = (outcome.log.labels[:, i] for i in range(3))
+    contact, code, phase = (outcome.log.labels[:, i] for i in range(3))
+    support, beside = system.supports(phase)
     row, used = unpack_row(values, outcome.state), contact >= 0
     safe = jax.tree.map(jnp.nan_to_num, frozen(outcome.state))  # harmless numbers for the rows that are not used
     before = jax.tree.map(lambda a, b: jnp.where(along(used, a), a, b), row.before, safe)
@@ -195,7 +198,7 @@ def _log(system: AbstractSystem, t0: Any, outcome: Outcome) -> ImpactLog:
     packed_before, packed_after = jax.vmap(system.packed)(row.before), jax.vmap(system.packed)(row.after)
     return ImpactLog(
         row.time, row.until, row.duration, contact, point, normal, packed_before, packed_after,
-        kind_of(jnp.maximum(code, 0)), support, grazing,
+        kind_of(jnp.maximum(code, 0)), support, beside, grazing,
     )  # fmt: skip
 
 

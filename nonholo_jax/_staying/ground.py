@@ -9,7 +9,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from .._impact import AbstractContactLaw, along_surface, rolling
+from .._impact import AbstractContactLaw, along_surface, groove, rolling
 from .._math import (
     Choice,
     Number,
@@ -77,8 +77,32 @@ class Travel(NamedTuple):
     below: Ground | None = None  # only while an arc is worked on
 
 
+_SIDES = 4096  # more surfaces than there may be in a scene with grooves
+
+
 def phase_of(state: Travel) -> Any:
     return jnp.asarray(state.support).astype(jnp.int32)
+
+
+def second_of(state: Travel) -> Any:
+    """The other surface of a ball in a groove, else -1: kept in the fractional part of `support`."""
+    support = jnp.asarray(state.support)
+    return jnp.round((support - jnp.trunc(support)) * _SIDES).astype(jnp.int32) - 1
+
+
+def support_of(first: Any, second: Any, dtype: Any) -> Any:
+    """What `Travel.support` is for these two."""
+    return jnp.asarray(first).astype(dtype) + (jnp.asarray(second) + 1).astype(dtype) / _SIDES
+
+
+def code_of(first: Any, second: Any) -> Any:
+    """One whole number for both, as the log keeps it."""
+    return first + _SIDES * (second + 1)
+
+
+def of_code(code: Any) -> tuple[Any, Any]:
+    is_known = code >= 0
+    return jnp.where(is_known, code % _SIDES, code), jnp.where(is_known, code // _SIDES - 1, -1)
 
 
 class Forced(NamedTuple):
@@ -133,6 +157,40 @@ class Footing:
         """Whether what holds a ball on a surface may end while nothing else happens."""
         return self.curved or (self.scene.air is not None and bool(self.floors.indices))
 
+    @property
+    def have_grooves(self) -> bool:
+        """Whether a ball may be followed along a groove between two surfaces."""
+        return self.curved and self.scene.n_contacts > 1
+
+    @property
+    def n_holds(self) -> int:
+        """How many pushes are followed."""
+        return self.follows_hold + self.have_grooves
+
+    def sides(self, time: Any, state: Travel, x: Vector3, v: Vector3, second: Any = None) -> groove.Sides:
+        """What is on both sides of the ball in a groove; harmless numbers for one that is in none."""
+        second = second_of(state) if second is None else second
+        inside, choices = second >= 0, [self.scene.choice(i) for i in (phase_of(state), second)]
+        normals, turns = [], []
+        for choice, plain in zip(choices, ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)), strict=True):
+            n, turn = self.floors.turning(choice, x, v, time)
+            normals.append(tuple(jnp.asarray(c, time.dtype) for c in where_vector(inside, n, plain)))
+            turns.append(where_vector(inside, turn, tuple(0.0 * c for c in normals[-1])))
+        grips = [self.floors.rolls(choice) for choice in choices]
+        return groove.Sides(tuple(normals), tuple(turns), tuple(jnp.asarray(g) for g in grips))  # pyright: ignore
+
+    def along_groove(
+        self, time: Any, state: Travel, q: tuple, v: tuple
+    ) -> tuple[groove.Sides, groove.Way, groove.Course]:
+        """How a ball goes along a groove."""
+        ball, x, (_, pivot) = self.scene.ball, q[:3], self.inner(q)
+        sides = self.sides(time, state, x, v)
+        path = groove.way(ball.radius, sides)
+        spin = groove.spin_of(path, dot(path.along, v), pivot, state.flight.spin, sides.grips[0] | sides.grips[1])
+        a, b, c = self.scene.derivative(time, state.flight._replace(spin=spin), x, v)[1]
+        pull = (jnp.asarray(a, time.dtype), jnp.asarray(b, time.dtype), jnp.asarray(c, time.dtype))
+        return sides, path, groove.course(ball.radius, ball.inertia_ratio, sides, v, pivot, pull)
+
     def ground(self, time: Any, state: Travel) -> Ground:
         flight, floors, on = state.flight, self.floors, state.support >= 0
         support = self.scene.choice(phase_of(state))
@@ -144,7 +202,7 @@ class Footing:
         pivot = where_vector(rolls, scale(dot(n, flight.spin), n), flight.spin)
         free = Freedom(where(on, 1.0, 0.0), share, pivot, where(rolls, ratio(1.0, ball.radius), 0.0))
         flush = self._flush(time, state, n) if self.joins else None
-        more = self._curved_ground(support, flight, n, on, rolls) if self.curved else {}
+        more = self._curved_ground(time, state, support, n, on, rolls) if self.curved else {}
         if not (floors.have_friction or any(floors.resist)):
             return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True, flush, **more)
         a = self.pull(time, flight)
@@ -164,6 +222,8 @@ class Footing:
             return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True, flush, brake=brake, **more)
         friction = floors.friction(support)
         slides = rolls & jnp.isfinite(friction)
+        if self.have_grooves:
+            slides = slides & (second_of(state) < 0)
         slip = rolling.own_slip(ball.radius, n, flight.velocity, flight.spin)
         slip = where_vector(slides, slip, rolling.NONE)
         drive = subtract(along, twist)
@@ -202,8 +262,15 @@ class Footing:
         begins = where(abs(driven) > most, jnp.sign(driven), 0.0)
         return coefficient, where(pivot != 0, jnp.sign(pivot), begins)
 
-    def _curved_ground(self, support: Choice, flight: Flight, n: Vector3, on: Any, rolls: Any) -> dict[str, Any]:
+    def _curved_ground(
+        self, time: Any, state: Travel, support: Choice, n: Vector3, on: Any, rolls: Any
+    ) -> dict[str, Any]:
+        flight = state.flight
         pivot = where(rolls, dot(n, flight.spin), 0.0)
+        if self.have_grooves:
+            sides = self.sides(time, state, flight.position, flight.velocity)
+            free = groove.way(self.scene.ball.radius, sides).free
+            pivot = where(second_of(state) >= 0, dot(free, flight.spin), pivot)
         seams = []
         for k in range(self.floors.n_seams):
             across, middle, half, present = self.floors.seam(support, k)
@@ -213,6 +280,26 @@ class Footing:
 
     def placed(self, time: Any, support: Any, flight: Flight) -> Flight:
         """The ball exactly on the curved surface that it stays on, going along it."""
+        return self._into_groove(time, support, self._onto_surface(time, support, flight))
+
+    def _into_groove(self, time: Any, support: Any, flight: Flight) -> Flight:
+        """The ball exactly on both surfaces of the groove that it is in, going along it."""
+        if not self.have_grooves:
+            return flight
+        state = Travel(flight, support)
+        inside, x, v = second_of(state) >= 0, flight.position, flight.velocity
+        sides = self.sides(time, state, x, v)
+        one, two = sides.normals
+        depths = [where(inside, self.floors.depth(self.scene.choice(i), x, n, time), 0.0)
+                  for i, n in zip((phase_of(state), second_of(state)), sides.normals, strict=True)]  # fmt: skip
+        meets = dot(one, two)
+        determinant = 1.0 - meets * meets
+        a, b = (ratio(depths[i] - meets * depths[1 - i], determinant) for i in (0, 1))
+        x = where_vector(inside, subtract(x, add(scale(a, one), scale(b, two))), x)
+        along = groove.way(self.scene.ball.radius, sides).along
+        return flight._replace(position=x, velocity=where_vector(inside, scale(dot(along, v), along), v))
+
+    def _onto_surface(self, time: Any, support: Any, flight: Flight) -> Flight:
         floor, x = self.scene.choice(jnp.asarray(support).astype(jnp.int32)), flight.position
         face, _ = self.floors.face(floor, x, time)
         n, depth = face.normal, self.floors.depth(floor, x, face.normal, time)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._impact import rolling, train
+from .._impact import groove, rolling, train
 from .._math import (
     KINDS,
     Hopper,
@@ -32,12 +32,13 @@ from .._math import (
     scale,
     subtract,
     times,
+    total,
     where,
     where_vector,
 )
 from .._world import AbstractSystem, Meeting, Member, Scene, bounces, may_be_flush, round_bend, round_level
 from .floors import Floors
-from .ground import Ground, Travel, phase_of
+from .ground import Ground, Travel, code_of, of_code, phase_of, second_of, support_of
 from .settling import Settling
 
 
@@ -102,7 +103,7 @@ class Grounded(AbstractSystem):
     @property
     def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         settling = self._settling
-        return (settling.end_of_hold + settling.follows_hold) if self.hits else 0
+        return (settling.end_of_hold + settling.n_holds) if self.hits else 0
 
     def engine(self, dtype):
         return dataclasses.replace(self, scene=self.scene.engine(dtype))
@@ -167,11 +168,15 @@ class Grounded(AbstractSystem):
             coefficient, sign = below.spinning
             lost = rolling.spin_loss(self.scene.ball, coefficient, -forced.push)
             spun = where((sign == 0) & (coefficient > 0), 0.0, spun - sign * lost)
+        if settling.have_grooves:
+            inside, (_, _, course) = second_of(state) >= 0, settling.along_groove(time, state, q, v)
+            rate, spun = where_vector(inside, course.acceleration, rate), where(inside, course.pivots, spun)
+            slows = tuple(where(inside, 0.0, each) for each in slows)
         return (*v, *changes, spun, *slows), rate
 
     @property
     def n_derived(self) -> int:
-        return int(self._settling.follows_hold and self.hits)
+        return self._settling.n_holds if self.hits else 0
 
     @property
     def degree_of_derived(self) -> int:
@@ -195,7 +200,26 @@ class Grounded(AbstractSystem):
                 drive = add(drive, scale(1.0 + 1.0 / self.scene.ball.inertia_ratio, settling.braked(below, forced, v)))
             spare = ratio(radius * (most * abs(most) - dot(drive, drive)), frozen(most * most + dot(drive, drive)))
             hold = where(limited, spare, hold)
-        return (where(on, hold, 1.0),)
+        if not settling.have_grooves:
+            return (where(on, hold, 1.0),)
+        inside, (sides, _, course) = second_of(state) >= 0, settling.along_groove(time, state, q, v)
+        first, second = self._holds_in_groove(state, sides, course)
+        return where(on, where(inside, first, hold), 1.0), where(inside, second, 1.0)
+
+    def _holds_in_groove(self, state: Travel, sides: Any, course: Any) -> list[Number]:
+        """`derived` on both sides of a groove."""
+        size = frozen(total([abs(push) for push in course.pushes]))
+        holds, floors = [], self._floors
+        for i, push, force in zip((phase_of(state), second_of(state)), course.pushes, course.forces, strict=True):
+            hold = ratio(self.scene.ball.radius * push, size)
+            if floors.have_friction:
+                friction = floors.friction(self.scene.choice(i))
+                limited = jnp.isfinite(friction) & floors.rolls(self.scene.choice(i))
+                most, used = where(limited, friction, 0.0) * push, dot(force, force)
+                spare = ratio(self.scene.ball.radius * (most * abs(most) - used), frozen(most * most + used))
+                hold = where(limited & (used > 0), spare, hold)
+            holds.append(hold)
+        return holds
 
     def rate_of(self, time, state):
         return state.flight.velocity
@@ -211,9 +235,15 @@ class Grounded(AbstractSystem):
             n, v = where_vector(state.support >= 0, face.normal, below.face.normal), flight.velocity
             still = where_vector(below.rolls, scale(pivot, n), free.spin)
             slip = rolling.along_surface(n, slip) if slip else slip
+            if settling.have_grooves:
+                sides = settling.sides(time, state, flight.position, v)
+                path, inside = groove.way(self.scene.ball.radius, sides), second_of(state) >= 0
+                grips = sides.grips[0] | sides.grips[1]
+                in_groove = groove.spin_of(path, dot(path.along, v), pivot, state.flight.spin, grips)
         elif below.spinning is not None:
             still = self._spun_down(time, state, below, duration)
         spin = add(still, scale(free.turning, cross(n, subtract(v, slip) if slip else v)))
+        spin = where_vector(inside, in_groove, spin) if settling.have_grooves else spin
         if orientation is not None:
             turning = subtract(state.flight.velocity, below.slip)
             before = add(free.spin, scale(free.turning, cross(below.face.normal, turning)))
@@ -232,16 +262,35 @@ class Grounded(AbstractSystem):
 
     # Contacts
 
+    def _is_on(self, state: Travel, number: Any) -> Any:
+        """Whether the ball stays on that surface."""
+        on = phase_of(state) == number
+        return on | (second_of(state) == number) if self._settling.have_grooves else on
+
     def phase(self, state):
         return phase_of(state)
 
     def named(self, contact, state):
-        return where(contact.index >= self._n_surfaces, self.phase(state), contact.index)
+        name = where(contact.index >= self._n_surfaces, self.phase(state), contact.index)
+        if not self._settling.have_grooves:
+            return name
+        return where(contact.index == self._settling.end_of_hold + 1, second_of(state), name)
+
+    def code(self, state):
+        if not self._settling.have_grooves:
+            return phase_of(state)
+        return where(state.support >= 0, code_of(phase_of(state), second_of(state)), np.int32(-1))
+
+    def supports(self, code):
+        return of_code(code) if self._settling.have_grooves else super().supports(code)
+
+    def code_of(self, support, beside):
+        return code_of(support, beside) if self._settling.have_grooves else support
 
     def left_by(self, contact):
         if not self._settling.follows_hold:
             return 0
-        return where(contact.index == self._settling.end_of_hold, np.int32(self.n_contacts), np.int32(0))
+        return where(contact.index >= self._settling.end_of_hold, np.int32(self.n_contacts), np.int32(0))
 
     def _below(self, time: Any, state: Travel) -> Ground:
         return self._settling.ground(time, state) if state.below is None else state.below
@@ -256,7 +305,7 @@ class Grounded(AbstractSystem):
     def level(self, contact, time, q, state):
         x = q[:3]
         if isinstance(contact, Member):
-            on = phase_of(state) == contact.number
+            on = self._is_on(state, contact.number)
             away = self.scene.level(contact, time, x, state.flight)
             if self.may_pass:
                 found = self._flush(contact, time, state)
@@ -269,8 +318,8 @@ class Grounded(AbstractSystem):
             heading = self._below(time, state).heading
             return where(dot(heading, heading) > 0, dot(heading, q[3:6]), 1.0)
         settling = self._settling
-        if contact == settling.end_of_hold:
-            return q[-1]
+        if contact >= settling.end_of_hold:
+            return q[contact - settling.end_of_hold - settling.n_holds]
         if contact >= settling.end_of_roll:
             sign, k = self._dying(contact, time, state)
             unit = 1.0 if contact == settling.end_of_roll else self.scene.ball.radius
@@ -311,7 +360,7 @@ class Grounded(AbstractSystem):
             return None
         back = self.scene.returns(contact, time, q[:3], v[:3], half_a[:3], state.flight)
         # A ball that rolls neither leaves its support nor comes back to it, whatever rounding says.
-        return None if back is None else back._replace(comes=back.comes & (phase_of(state) != contact.number))
+        return None if back is None else back._replace(comes=back.comes & ~self._is_on(state, contact.number))
 
     def reach(self, contact, q):
         return self.scene.reach(contact, q[:3]) if isinstance(contact, Member) else self.scene.ball.radius
@@ -319,7 +368,7 @@ class Grounded(AbstractSystem):
     def bend(self, contact, time, window, state):
         place = window._replace(coefficients=window.coefficients[:3])
         if isinstance(contact, Member):
-            bend, skip = self.scene.bend(contact, time, place, state.flight), phase_of(state) == contact.number
+            bend, skip = self.scene.bend(contact, time, place, state.flight), self._is_on(state, contact.number)
             if self.may_pass:
                 found = self._flush(contact, time, state)
                 bends = [round_bend(place, (axis,), middle, half, False) for axis, middle, half in found.rim]
@@ -331,8 +380,9 @@ class Grounded(AbstractSystem):
             heading = self._below(time, state).heading
             bend = window._replace(coefficients=window.coefficients[3:6]).along(heading, rolling.NONE).bend
             skip = dot(heading, heading) == 0
-        elif contact == self._settling.end_of_hold:
-            bend, skip = window.track(window.coefficients[-1]).bend, phase_of(state) < 0
+        elif contact >= self._settling.end_of_hold:
+            k = contact - self._settling.end_of_hold - self._settling.n_holds
+            bend, skip = window.track(window.coefficients[k]).bend, phase_of(state) < 0
         elif contact >= self._settling.end_of_roll:
             sign, k = self._dying(contact, time, state)
             unit = 1.0 if contact == self._settling.end_of_roll else self.scene.ball.radius
@@ -428,6 +478,9 @@ class Grounded(AbstractSystem):
         flight = self.scene.unpacked(state)
         dtype = state.position.dtype
         support = jnp.asarray(-1.0, dtype=dtype) if phase is None else jnp.asarray(phase).astype(dtype)
+        if phase is not None and self._settling.have_grooves:
+            first, second = of_code(jnp.asarray(phase))
+            support = support_of(first, second, dtype)
         return Travel(flight, support)
 
     def packed(self, state):

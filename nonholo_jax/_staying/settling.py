@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .._impact import rolling, train
+from .._impact import groove, rolling, train
 from .._math import (
     KINDS,
     RESULTS,
@@ -28,7 +28,7 @@ from .._math import (
     where_vector,
 )
 from .._world import Face, Flight, Meeting, Member, Neighbours, Support, magnitude, neighbours, numbers_of, rounding
-from .ground import Footing, Travel, phase_of
+from .ground import Footing, Travel, phase_of, second_of, support_of
 
 
 class Touch(NamedTuple):
@@ -184,7 +184,7 @@ class Settling(Footing):
         contact, on, first, law = touch.contact, touch.on, touch.first, touch.law
         is_exit = contact.index >= self.scene.n_contacts
         grips = (contact.index == self.end_of_slip) & self.floors.have_friction
-        lifts = (contact.index == self.end_of_hold) if self.follows_hold else False
+        lifts = (contact.index >= self.end_of_hold) if self.follows_hold else False
         is_floor = self.floors.include(contact) & touch.face.below & (first.pull > 0)
         lasts, clear, sums = self._sums(touch)
         capped = law.rolls & jnp.isfinite(jnp.inf if law.friction is None else law.friction)
@@ -204,6 +204,8 @@ class Settling(Footing):
         if self.follows_hold and self.floors.have_friction:
             over = KINDS.where(jnp.asarray(lifts) & self._begins_to_slip(touch), KINDS.slipped, over)
         kind = KINDS.where(on, KINDS.where(is_exit, over, KINDS.rolling), bounce_or_end)
+        enters, slips_there, cornered = self._in_groove(touch, rests) if self.have_grooves else (False, False, False)
+        kind = KINDS.where(jnp.asarray(enters) | cornered, KINDS.groove, kind) if self.have_grooves else kind
         passes = touch.onto >= 0 if self.joins else False
         kind = KINDS.where(passes, KINDS.passed, kind) if self.joins else kind
 
@@ -211,6 +213,8 @@ class Settling(Footing):
         after, pause, wedged, is_at_rest = self.settled(touch, kind, end)
         stuck = ~is_exit & where(on, rests & ~wedged, ends & ~is_floor)
         stuck = stuck & ~passes if self.joins else stuck
+        if self.have_grooves:
+            stuck, is_at_rest = (stuck & ~enters & ~cornered) | slips_there, is_at_rest | cornered
         fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
         fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
         goes = is_exit & ~grips & ~jnp.asarray(lifts) & ~jnp.asarray(stops)
@@ -225,6 +229,61 @@ class Settling(Footing):
             bends = (after.support >= 0) & ~straight
             fault = RESULTS.where(bends, RESULTS.curved_slide, fault)
         return Meeting(kind, fault, after, pause, is_at_rest)
+
+    def _in_groove(self, touch: Touch, rests: Any) -> tuple[Any, Any, Any]:
+        """Whether a ball on one surface goes on along the groove that another one makes with it, whether one in a groove
+        would have to slip there, which is not followed, and whether a third surface holds it in a corner."""
+        state, index, on = touch.state, touch.contact.index, touch.on
+        flight, time, eps = state.flight, touch.time, float(jnp.finfo(touch.time.dtype).eps)
+        alone, is_met = second_of(state) < 0, index < self.scene.n_contacts
+        beside = where(alone & is_met, index, second_of(state))
+        joined = state._replace(support=support_of(phase_of(state), beside, time.dtype))
+        sides, path, course, speed, pivot = self._entry(touch, joined)
+        size = norm(touch.pull) + norm(course.acceleration)
+        pressed = (course.pushes[0] > eps * size) & (course.pushes[1] > eps * size)
+        fits = on & is_met & alone & rests & self.floors.include(touch.contact)
+        spin = groove.spin_of(path, speed, pivot, flight.spin, sides.grips[0] | sides.grips[1])
+        enters = fits & pressed & self._can_grip(joined, course, spin, speed)
+        third = tuple(jnp.asarray(c, time.dtype) for c in touch.normal)
+        one, two = sides.normals
+        into = scale(-1.0, self.pull(time, flight))
+        volume = dot(cross(one, two), third)
+        parts = [ratio(dot(cross(a, b), c), volume)
+                 for a, b, c in ((into, two, third), (one, into, third), (one, two, into))]  # fmt: skip
+        held = (parts[0] >= 0) & (parts[1] >= 0) & (parts[2] >= 0) & (abs(volume) > eps**0.5)
+        still = (sides.grips[0] | sides.grips[1]) & (self.scene.air is None)
+        cornered = on & is_met & ~alone & rests & held & still
+        over = (index >= self.end_of_hold) & ~alone & on
+        push = where(index == self.end_of_hold, course.pushes[0], course.pushes[1])
+        return enters, over & (push > eps**0.5 * size), cornered
+
+    def _entry(self, touch: Touch, joined: Travel) -> tuple:
+        """A groove as a ball comes into it: its sides, its way, how it goes there, its speed and its free spin."""
+        flight, ball, time = joined.flight, self.scene.ball, touch.time
+        sides = self.sides(time, joined, flight.position, flight.velocity)
+        path = groove.way(ball.radius, sides)
+        speed, pivot = groove.entered(ball.radius, ball.inertia_ratio, path, flight.velocity, flight.spin)
+        along = scale(speed, path.along)
+        sides = self.sides(time, joined, flight.position, along)
+        spin = groove.spin_of(path, speed, pivot, flight.spin, sides.grips[0] | sides.grips[1])
+        x, y, z = self.pull(time, flight._replace(velocity=along, spin=spin))
+        pull = (jnp.asarray(x, time.dtype), jnp.asarray(y, time.dtype), jnp.asarray(z, time.dtype))
+        course = groove.course(ball.radius, ball.inertia_ratio, sides, along, pivot, pull)
+        return sides, path, course, speed, pivot
+
+    def _can_grip(self, joined: Travel, course: groove.Course, spin: Vector3, speed: Number) -> Any:
+        """Whether friction can hold a ball in a groove, into which it does not come slipping; and nothing resists it."""
+        flight, radius, floors, grips = joined.flight, self.scene.ball.radius, self.floors, True
+        for i, push, force in zip((phase_of(joined), second_of(joined)), course.pushes, course.forces, strict=True):
+            floor = self.scene.choice(i)
+            if floors.resist[0]:
+                grips = grips & ~(floors.resistance(floor, 0) > 0)
+            if floors.have_friction:
+                friction, rolls = floors.friction(floor), floors.rolls(floor)
+                slow = norm(subtract(flight.spin, spin)) * radius <= 1e-3 * (abs(speed) + radius * norm(spin))
+                holds = slow & (dot(force, force) <= (friction * push) ** 2)
+                grips = grips & (~(rolls & jnp.isfinite(friction)) | holds)
+        return grips
 
     def _stopped(self, touch: Touch) -> tuple[Vector3, Vector3]:
         """Velocity and spin of a ball whose rolling, or spinning about the normal, has died out."""
@@ -291,6 +350,8 @@ class Settling(Footing):
             stays = stays | (on & stops)
         held, pull = self._held(touch)
         wedged = self._is_wedged(touch, held, pull)
+        if self.have_grooves:
+            wedged = wedged & (second_of(touch.state) < 0)
         kept = [where_vector(wedged, rolling.NONE, x) for x in kept]
 
         velocity = where_vector(left, flight.velocity, where_vector(stays, kept[0], struck.velocity))
@@ -300,16 +361,38 @@ class Settling(Footing):
             velocity=where_vector(settles, end.velocity, velocity),
             spin=where_vector(settles & touch.law.rolls, end.spin, spin),
         )
-        surface = touch.contact.index.astype(jnp.asarray(touch.state.support).dtype)
-        support = where(settles, surface, where(stays, touch.state.support, -1.0))
+        surface, support = touch.contact.index.astype(touch.time.dtype), touch.state.support
+        if self.have_grooves:
+            enters, support, after = self._beside(touch, kind, after)
+            stays = stays | enters
+        support = where(settles, surface, where(stays, support, -1.0))
         if self.joins:
             passed, onto = kind == KINDS.passed, touch.onto
-            support = where(passed, onto.astype(support.dtype), support)
+            within = (onto == phase_of(touch.state)) & self.have_grooves  # a groove goes on over a seam
+            support = where(passed, where(within, touch.state.support, onto.astype(support.dtype)), support)
             after = self._passed(passed, onto, touch, after)
         if self.curved:
             after = self.placed(touch.time, support, after)
         at_rest = (settles | stays) & self._is_still(touch, after, held)
         return Travel(after, support), where(settles, end.time, 0.0), wedged, at_rest
+
+    def _beside(self, touch: Touch, kind: KINDS, after: Flight) -> tuple[Any, Any, Flight]:
+        """Whether a ball stays that comes into a groove, or out of one onto one of its sides; its support, and its state.
+        An impact on a third surface takes it off the second one, to which it comes back."""
+        state, index, dtype = touch.state, touch.contact.index, touch.time.dtype
+        first, second = phase_of(state), second_of(state)
+        enters, left = kind == KINDS.groove, (kind == KINDS.left) & (second >= 0) & (index >= self.end_of_hold)
+        joined = state._replace(support=support_of(first, where(second >= 0, second, index), dtype))
+        sides, path, _, speed, pivot = self._entry(touch, joined)
+        spin = groove.spin_of(path, speed, pivot, state.flight.spin, sides.grips[0] | sides.grips[1])
+        rests = enters & (second >= 0)  # in a corner
+        after = after._replace(
+            velocity=where_vector(enters, where_vector(rests, rolling.NONE, scale(speed, path.along)), after.velocity),
+            spin=where_vector(enters, where_vector(rests, rolling.NONE, spin), after.spin),
+        )
+        alone = where(left & (index == self.end_of_hold), second, first).astype(dtype)
+        goes_on = (index >= self.scene.n_contacts) & ~left
+        return enters | left, where(enters, joined.support, where(goes_on, state.support, alone)), after
 
     def _passed(self, passed: Any, onto: Any, touch: Touch, after: Flight) -> Flight:
         """The state of a ball that has passed onto a flush face: as it was, but where it cannot slip it rolls."""

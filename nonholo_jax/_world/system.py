@@ -42,6 +42,19 @@ class AbstractSystem(eqx.Module):
         del time, state, q, v
         return ()
 
+    def code(self, state: Any) -> Index:
+        """`phase`, with all that the log has to know of it."""
+        return self.phase(state)
+
+    def supports(self, code: Any) -> tuple[Any, Any]:
+        """The surfaces that a code stands for: the one that the system stays on, and the second one of a groove, or -1."""
+        return code, jnp.full_like(code, -1)
+
+    def code_of(self, support: Any, beside: Any) -> Any:
+        """The code of two surfaces: the inverse of `supports`."""
+        del beside
+        return support
+
     def left_by(self, contact: Choice) -> Any:
         """What the search is told beside the number of the contact that is left: `n_contacts` if the state moves off it
         with neither velocity nor acceleration, as where its push ends, else 0."""
