@@ -1,11 +1,11 @@
 """A ball that touches two surfaces at once and goes along the groove between them: one degree of freedom.
 
-With the normals n1 and n2, c = |n1 x n2| and e = (n1 x n2) / c, the velocity is w e. A ball that slips at neither contact
-has v = r omega x n1 = r omega x n2, so that omega = w (n1 - n2) / (r c). One that slips at the first alone does so freely
-there, and omega = w (n2 x e) / r + pivot n2; one that slips at both keeps its spin. Kane's equations, with G = diag(1,
-alpha r^2) and the rates of these directions, give dw/dt and dpivot/dt. The torque gives the forces along the surfaces,
-but for the share of those across the groove, of which each contact takes the same; the rest of the acceleration gives the
-two pushes.
+With the normals n1 and n2, c = |n1 x n2| and e = (n1 x n2) / c, the velocity is w e. A ball that slips at neither
+contact has v = r omega x n1 = r omega x n2, so that omega = w (n1 - n2) / (r c). One that slips at the first alone,
+where nothing holds it, has omega = w (n2 x e) / r + pivot n2; one that slips at both keeps its spin. Kane's equations,
+with G = diag(1, alpha r^2) and the rates of these directions, give dw/dt and dpivot/dt. The torque gives the forces
+along the surfaces, but for the share of those across the groove, of which each contact takes the same; the rest of the
+acceleration gives the two pushes.
 """
 
 from typing import Any, NamedTuple

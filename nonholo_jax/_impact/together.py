@@ -226,7 +226,7 @@ def _at_most_elastic(y: Any, change: Any) -> Any:
     """The part of a change, at most 1, by which y may be lessened without growing in size."""
     most, size = 2.0 * matmul(y, change), _above_rounding(matmul(change, change), y)
     eps = float(jnp.finfo(y.dtype).eps)
-    grows = most < size * (1.0 - 256.0 * eps)
+    grows = (most < size * (1.0 - 256.0 * eps)) & (size > 0)  # a change that is rounding is not judged
     return jnp.where(grows, jnp.maximum(most, 0.0) / jnp.where(grows, size, 1.0), 1.0)
 
 

@@ -44,12 +44,14 @@ class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
     )
     pivoting = (
         "The ball came to the edge of a face too slowly to fly off (v^2 < g r across the edge): it tips over the edge, "
-        "which this motion does not follow. Try `motion=Exact(contact=Integrated())` (in air `Integrated(edges=True)`)."
+        "which this motion does not follow. Try `motion=Exact(contact=Integrated())` (in air `Integrated(edges=True)`; "
+        "in a scene file `contact = true`)."
     )
     sustained_contact = (
         "The ball stays in contact with a surface (it rests, rolls, or its bounces have died out below rounding) in a "
         "way that this motion does not follow. Try `motion=Exact(contact=Integrated())` (in air "
-        "`Integrated(edges=True)`), or `throw=False` and `Trajectory.t1` for the time reached."
+        "`Integrated(edges=True)`; in a scene file `contact = true`), or `throw=False` and `Trajectory.t1` for how far "
+        "it came."
     )
     curved_slide = (
         "The ball slides across a slope, against friction: its slip turns, so that its path is no parabola. Try "

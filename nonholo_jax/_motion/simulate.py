@@ -12,6 +12,7 @@ import numpy as np
 
 from .._math import (
     LEAST_EFFORT,
+    NAMES_OF_RESULTS,
     NO_FAILURES,
     WIDEST_VECTORS,
     as_number,
@@ -26,7 +27,7 @@ from .._math import (
     result_name,
     with_options,
 )
-from .._staying import grounded, slides_across, stays_curved
+from .._staying import Grounded, grounded, slides_across, stays_curved
 from .._world import AbstractSystem, Scene
 from .accuracy import motion_for
 from .integrated import Integrated
@@ -73,7 +74,9 @@ def simulate(
         to the other; 0 for none.
     - `motion`: `Exact()` or `Integrated(...)`; `None` picks `Exact()` where the scene allows it, else `Integrated()`:
         with air, a gap whose curvature is neither given nor bounded by its program, or friction on a slope, across
-        which a ball slides along a curve.
+        which a ball slides along a curve. In a scene with the inside of a sphere or a cylinder, or an `Implicit`, it
+        picks `Exact(contact=Integrated())`; so it does, in a second program, where a ball that is not traced stays on
+        something in a way that `Exact()` does not follow.
     - `accuracy`: instead of `motion`, the error of the final position, in m, that is wanted: a Python number > 0. Picks
         `Exact()` where the scene allows it, else solver and tolerances that 99 of 100 throws of
         `experiments/benchmarks/bench_accuracy.py` reach it with; an expectation, no bound. Grazing throws may miss it.
@@ -97,7 +100,7 @@ def simulate(
     ```
     """
     _check_scene(scene, tuple(_axes(scene, None)))
-    wanted = None if accuracy is None else (accuracy, state, t0, t1)
+    wanted, chosen = None if accuracy is None else (accuracy, state, t0, t1), motion is None and accuracy is None
     motion, log_rows = checked(scene, motion, max_impacts, log_size, slides=sum_trains, wanted=wanted)
     system = _continued(scene, motion, sum_trains)
     log_rows = system.most_rows(log_rows) if log_size is None else log_rows
@@ -107,8 +110,23 @@ def simulate(
     _check_times(t0, t1)
     move = _run_few if motion.is_closed_form and max_impacts <= _FEW_IMPACTS else _run
     trajectory = move(system, motion, state, t0, t1, max_impacts, log_rows, adjoint)
+    if chosen and sum_trains and _is_unfollowed(trajectory, motion):
+        motion = Exact(contact=Integrated()) if motion.is_closed_form else dataclasses.replace(motion, edges=True)
+        options = {"max_impacts": max_impacts, "log_size": log_size, "adjoint": adjoint, "throw": throw}
+        return simulate(scene, state, t1=t1, t0=t0, motion=motion, **options)
     trajectory = _told(trajectory, scene.unbounded(state))
     return _raised(trajectory) if throw else trajectory
+
+
+def _is_unfollowed(trajectory: Trajectory, motion: AbstractMotion) -> bool:
+    """Whether a motion that is known, not traced, ended because the ball stays on something in a way that takes an
+    integrator."""
+    code = trajectory.result._value  # pyright: ignore[reportAttributeAccessIssue]
+    if isinstance(code, jax.core.Tracer) or not isinstance(trajectory.system, Scene | Grounded):
+        return False
+    plain = isinstance(motion, Exact) and motion.contact is None
+    plain = plain or (isinstance(motion, Integrated) and motion.edges is None)
+    return plain and NAMES_OF_RESULTS[int(code)] in ("sustained_contact", "pivoting")
 
 
 def simulate_batch(

@@ -18,11 +18,13 @@ from .._math import (
     components,
     cross,
     dot,
+    frozen,
     norm,
     plus,
     ratio,
     scale,
     subtract,
+    total,
     where,
     where_vector,
 )
@@ -190,6 +192,21 @@ class Footing:
         a, b, c = self.scene.derivative(time, state.flight._replace(spin=spin), x, v)[1]
         pull = (jnp.asarray(a, time.dtype), jnp.asarray(b, time.dtype), jnp.asarray(c, time.dtype))
         return sides, path, groove.course(ball.radius, ball.inertia_ratio, sides, v, pivot, pull)
+
+    def holds_in_groove(self, state: Travel, sides: Any, course: Any) -> list[Number]:
+        """`derived` on both sides of a groove."""
+        size = frozen(total([abs(push) for push in course.pushes]))
+        holds, floors = [], self.floors
+        for i, push, force in zip((phase_of(state), second_of(state)), course.pushes, course.forces, strict=True):
+            hold = ratio(self.scene.ball.radius * push, size)
+            if floors.have_friction:
+                friction = floors.friction(self.scene.choice(i))
+                limited = jnp.isfinite(friction) & floors.rolls(self.scene.choice(i))
+                most, used = where(limited, friction, 0.0) * push, dot(force, force)
+                spare = ratio(self.scene.ball.radius * (most * abs(most) - used), frozen(most * most + used))
+                hold = where(limited & (used > 0), spare, hold)
+            holds.append(hold)
+        return holds
 
     def ground(self, time: Any, state: Travel) -> Ground:
         flight, floors, on = state.flight, self.floors, state.support >= 0

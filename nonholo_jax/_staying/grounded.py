@@ -32,7 +32,6 @@ from .._math import (
     scale,
     subtract,
     times,
-    total,
     where,
     where_vector,
 )
@@ -203,23 +202,8 @@ class Grounded(AbstractSystem):
         if not settling.have_grooves:
             return (where(on, hold, 1.0),)
         inside, (sides, _, course) = second_of(state) >= 0, settling.along_groove(time, state, q, v)
-        first, second = self._holds_in_groove(state, sides, course)
+        first, second = settling.holds_in_groove(state, sides, course)
         return where(on, where(inside, first, hold), 1.0), where(inside, second, 1.0)
-
-    def _holds_in_groove(self, state: Travel, sides: Any, course: Any) -> list[Number]:
-        """`derived` on both sides of a groove."""
-        size = frozen(total([abs(push) for push in course.pushes]))
-        holds, floors = [], self._floors
-        for i, push, force in zip((phase_of(state), second_of(state)), course.pushes, course.forces, strict=True):
-            hold = ratio(self.scene.ball.radius * push, size)
-            if floors.have_friction:
-                friction = floors.friction(self.scene.choice(i))
-                limited = jnp.isfinite(friction) & floors.rolls(self.scene.choice(i))
-                most, used = where(limited, friction, 0.0) * push, dot(force, force)
-                spare = ratio(self.scene.ball.radius * (most * abs(most) - used), frozen(most * most + used))
-                hold = where(limited & (used > 0), spare, hold)
-            holds.append(hold)
-        return holds
 
     def rate_of(self, time, state):
         return state.flight.velocity

@@ -231,8 +231,8 @@ class Settling(Footing):
         return Meeting(kind, fault, after, pause, is_at_rest)
 
     def _in_groove(self, touch: Touch, rests: Any) -> tuple[Any, Any, Any]:
-        """Whether a ball on one surface goes on along the groove that another one makes with it, whether one in a groove
-        would have to slip there, which is not followed, and whether a third surface holds it in a corner."""
+        """Whether a ball on one surface goes on along the groove that another one makes with it; whether one in a
+        groove would have to slip, which is not followed; and whether a third surface holds it in a corner."""
         state, index, on = touch.state, touch.contact.index, touch.on
         flight, time, eps = state.flight, touch.time, float(jnp.finfo(touch.time.dtype).eps)
         alone, is_met = second_of(state) < 0, index < self.scene.n_contacts
@@ -272,7 +272,7 @@ class Settling(Footing):
         return sides, path, course, speed, pivot
 
     def _can_grip(self, joined: Travel, course: groove.Course, spin: Vector3, speed: Number) -> Any:
-        """Whether friction can hold a ball in a groove, into which it does not come slipping; and nothing resists it."""
+        """Whether friction can hold a ball in a groove, into which it comes without slip, and nothing resists it."""
         flight, radius, floors, grips = joined.flight, self.scene.ball.radius, self.floors, True
         for i, push, force in zip((phase_of(joined), second_of(joined)), course.pushes, course.forces, strict=True):
             floor = self.scene.choice(i)
@@ -377,7 +377,7 @@ class Settling(Footing):
         return Travel(after, support), where(settles, end.time, 0.0), wedged, at_rest
 
     def _beside(self, touch: Touch, kind: KINDS, after: Flight) -> tuple[Any, Any, Flight]:
-        """Whether a ball stays that comes into a groove, or out of one onto one of its sides; its support, and its state.
+        """Whether a ball stays that comes into a groove, or out of one onto one of its sides; its support; its state.
         An impact on a third surface takes it off the second one, to which it comes back."""
         state, index, dtype = touch.state, touch.contact.index, touch.time.dtype
         first, second = phase_of(state), second_of(state)

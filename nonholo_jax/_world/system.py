@@ -47,7 +47,7 @@ class AbstractSystem(eqx.Module):
         return self.phase(state)
 
     def supports(self, code: Any) -> tuple[Any, Any]:
-        """The surfaces that a code stands for: the one that the system stays on, and the second one of a groove, or -1."""
+        """The surfaces that a code stands for: the one that the system stays on; the second one of a groove, or -1."""
         return code, jnp.full_like(code, -1)
 
     def code_of(self, support: Any, beside: Any) -> Any:

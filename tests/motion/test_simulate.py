@@ -83,9 +83,13 @@ def ways_to_end():
             (inelastic, resting, {}),
             (table, slow, {}),
         ],
-        "at_rest": [(inelastic, drop, {"t1": 10.0}), (plastic, drop, {})],
+        "at_rest": [
+            (inelastic, drop, {"t1": 10.0}),
+            (plastic, drop, {}),
+            (bowl, drop, {"t1": 10.0, "max_impacts": 200}),
+        ],
         "no_limit": [(endless, THROW, {"t1": 10.0})],
-        "pivoting": [(table, slow, {"t1": 10.0})],
+        "pivoting": [(table, slow, {"t1": 10.0, "motion": Exact()})],
         "max_impacts": [(SCENE, THROW, {"max_impacts": 0}), (SCENE, THROW, {"t1": 20.0, "max_impacts": 3})],
         "step_limit": [(SCENE, THROW, {"motion": Integrated(max_steps=3, dt0=1e-3)})],
         "invalid_state": [
@@ -100,7 +104,7 @@ def ways_to_end():
             (SCENE, THROW, {"t1": jnp.inf}),
         ],
         "sustained_contact": [
-            (SCENE, resting, {}),
+            (SCENE, resting, {"motion": Exact()}),
             (plastic, THROW, {"sum_trains": False}),
             (inelastic, THROW, {"t1": 10.0, "max_impacts": 200, "sum_trains": False}),
             (bowl, drop, {"t1": 10.0, "max_impacts": 200, "motion": Exact()}),

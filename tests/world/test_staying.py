@@ -11,6 +11,7 @@ from helpers import result_of, results_of, turned_axes
 from scipy.integrate import solve_ivp
 
 from nonholo_jax import (
+    RESULTS,
     Air,
     Ball,
     BallState,
@@ -24,6 +25,7 @@ from nonholo_jax import (
     Rectangle,
     Rough,
     Scene,
+    SimulationError,
     Smooth,
     Sphere,
     energy,
@@ -213,6 +215,76 @@ def test_friction_that_cannot_hold_it_lets_it_slip():
     assert abs(np.sqrt(1 - cosine**2) * k - friction * (cosine - fast)) < 1e-5
 
 
+# Grooves
+
+
+ROUGH, SMOOTH, FRICTION = Rough(0.3), Smooth(0.3), Frictional(0.3, 0.0, 0.9)
+SIDES = {
+    "both rough": (ROUGH, ROUGH),
+    "both smooth": (SMOOTH, SMOOTH),
+    "one rough": (ROUGH, SMOOTH),
+    "friction": (FRICTION, FRICTION),
+}
+
+
+def valley(laws, opening=0.6, tilt=0.1):
+    """Two planes that meet along y, each `opening` from the upright, under a gravity that is tilted along them."""
+    n = np.array([np.cos(opening), 0.0, np.sin(opening)])
+    planes = {"left": Plane((0, 0, 0), n, laws[0]), "right": Plane((0, 0, 0), n * [-1, 1, 1], laws[1])}
+    return planes, R / np.sin(opening), (0.0, -G * np.sin(tilt), -G * np.cos(tilt))
+
+
+@motions
+@pytest.mark.parametrize("laws", SIDES.values(), ids=SIDES)
+def test_along_a_groove(laws, motion):
+    """In closed form: gripped at both sides it is as heavy as 1 + alpha |Omega|^2 r^2 says, with v = Omega x r n."""
+    opening, tilt = 0.6, 0.1
+    planes, height, gravity = valley(laws, opening, tilt)
+    out = run(planes, BallState([0, 0, height + 0.01], [0, 0.3, 0], [-3.0, 0, 0]), 1.5, motion, gravity=gravity,
+              max_impacts=300)  # fmt: skip
+    assert result_of(out) == "reached_t1" and kinds(out)[-1] == "groove"
+    row = int(out.n_rows) - 1
+    assert {int(out.impacts.support[row]), int(out.impacts.beside[row])} == {0, 1}
+    grips = [not isinstance(law, Smooth) for law in laws]
+    # The two contacts lie r sin(opening) below the centre: about that line a ball turns that grips at both.
+    share = {0: 1.0, 1: 1.0 + ALPHA, 2: 1.0 + ALPHA / np.sin(opening) ** 2}[sum(grips)]
+    start = float(out.impacts.until[row])
+    x, v = (np.asarray(part[row]) for part in (out.impacts.after.position, out.impacts.after.velocity))
+    dt, a = 1.5 - start, -G * np.sin(tilt) / share
+    np.testing.assert_allclose(out.final.position, [0.0, x[1] + v[1] * dt + 0.5 * a * dt**2, height], atol=1e-7)
+    np.testing.assert_allclose(out.final.velocity, [0.0, v[1] + a * dt, 0.0], atol=1e-7)
+    middle = out.at(jnp.asarray(start + 0.5 * dt))
+    np.testing.assert_allclose(middle.velocity[1], v[1] + 0.5 * a * dt, atol=1e-7)
+
+
+@motions
+def test_round_a_post_in_a_bowl(motion):
+    """Smooth: a circle with one push from the bowl and one from the post, at an even speed; energy and height stay."""
+    bowl = Sphere((0, 0, 1), 1.0, Smooth(0.0), inside=True)
+    post = Cylinder((0, 0, 0), (0, 0, 1), 0.3, Smooth(0.0))
+    rho = 0.4
+    z, v = 1.0 - np.sqrt(0.9**2 - rho**2), 0.5
+    out = run({"bowl": bowl, "post": post}, BallState([rho, 0, z], [0, v, 0], [0, 0, 0]), 2.0, motion, max_impacts=300)
+    assert result_of(out) == "reached_t1" and "groove" in kinds(out)
+    turned = 2.0 * v / rho
+    np.testing.assert_allclose(out.final.position, [rho * np.cos(turned), rho * np.sin(turned), z], atol=1e-6)
+    # Faster than v^2 = g rho tan(slope) the bowl carries it away from the post.
+    fast = 1.2 * np.sqrt(G * rho * rho / np.sqrt(0.81 - rho**2))
+    out = run(
+        {"bowl": bowl, "post": post}, BallState([rho, 0, z], [0, fast, 0], [0, 0, 0]), 1.0, motion, max_impacts=300
+    )
+    assert "groove" not in kinds(out) and result_of(out) == "reached_t1"
+
+
+def test_in_a_corner_it_comes_to_rest():
+    """Against a wall across the groove, which holds it there."""
+    planes, height, gravity = valley(SIDES["both rough"])
+    planes["end"] = Plane((0, -1.0, 0), (0, 1, 0), Rough(0.3))
+    out = run(planes, BallState([0, 0, height + 0.01], [0, 0.0, 0], [0, 0, 0]), 20.0, gravity=gravity, max_impacts=500)
+    assert result_of(out) == "at_rest"
+    np.testing.assert_allclose(out.final.position, [0.0, -1.0 + R, height], atol=1e-7)
+
+
 # Elastic surfaces, resistance
 
 
@@ -362,10 +434,15 @@ def test_it_tips_over_the_edge_of_a_thin_plate_as_over_that_of_a_box():
 def test_refusals_name_the_remedy():
     table = {"table": Box((0, 0, -1), (1, 1, 1), Rough(0.5))}
     state = BallState([0.9, 0.0, R], [0.3, 0.0, 0.0], [0.0, 3.0, 0.0])
-    out = run(table, state, 2.0, None)
+    out = run(table, state, 1.0, Exact())
     assert result_of(out) == "pivoting"
-    with pytest.raises(Exception, match="contact=Integrated"):
-        simulate(Scene(BALL, table), state, t1=2.0)
+    with pytest.raises(SimulationError, match="contact=Integrated"):
+        simulate(Scene(BALL, table), state, t1=1.0, motion=Exact())
+    # Where no motion is asked for, and nothing is traced, it is found by a second try.
+    again, asked = run(table, state, 1.0, None), run(table, state, 1.0, Exact(contact=Integrated()))
+    np.testing.assert_array_equal(again.final.position, asked.final.position)
+    traced = jax.jit(lambda state: run(table, state, 1.0, None).result)(state)
+    assert traced == RESULTS.pivoting
     with pytest.raises(ValueError, match="`contact` must be None or Integrated"):
         Exact(contact=Exact())
     with pytest.raises(ValueError, match="`rolling` must not be negative"):
