@@ -4,8 +4,8 @@
     python experiments/extremes/refusals.py [--throws 100000] [--plain] [--json FILE]
 
 Every number of the scenes is drawn anew for each throw, as in `random_scenes.py`. A throw counts as refused if its
-result is neither a success nor `max_impacts` (bounces that go on, most of them of restitution near 1). At its end no ball
-may be inside anything, by distances in NumPy, and the energy may not have grown. Exit code 1 where a throw breaks that.
+result is neither a success nor `max_impacts` (bounces that go on, most of them of restitution near 1). At its end no
+ball may be inside anything, by distances in NumPy, nor may the energy have grown. Exit code 1 where one breaks that.
 """
 
 import argparse

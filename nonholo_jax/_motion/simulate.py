@@ -108,7 +108,8 @@ def simulate(
     dtype = jax.tree.leaves(state)[0].dtype
     t0, t1 = (_array(t, dtype) for t in (t0, t1))
     _check_times(t0, t1)
-    move = _run_few if motion.is_closed_form and max_impacts <= _FEW_IMPACTS else _run
+    is_long = isinstance(system, Grounded) and system.curved  # a program that takes much longer to make than to run
+    move = _run_few if is_long or (motion.is_closed_form and max_impacts <= _FEW_IMPACTS) else _run
     trajectory = move(system, motion, state, t0, t1, max_impacts, log_rows, adjoint)
     if chosen and sum_trains and _is_unfollowed(trajectory, motion):
         motion = Exact(contact=Integrated()) if motion.is_closed_form else dataclasses.replace(motion, edges=True)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._math import KINDS, RESULTS, along, frozen
+from .._math import KINDS, LEAST_EFFORT, RESULTS, along, frozen, with_options
 from .._world import AbstractSystem
 from .loop import Outcome, kind_of, unpack_row
 from .motion import AbstractMotion
@@ -83,10 +83,10 @@ class Trajectory(eqx.Module):
         before `t`, not interpolated. Right-continuous at impacts; NaN outside [t0, t1], and after the last impact
         that was logged if the log is shorter than the motion. Returns a state with the batch axis, if any, and then
         the axes of `t` in front. Differentiable in both modes."""
-        return _at(self, jnp.asarray(t, dtype=self.t1.dtype))
+        long = self.n_impacts.ndim == 0 and not self.motion.is_closed_form
+        return (_at_with_least_effort if long else _at_by_default)(self, jnp.asarray(t, dtype=self.t1.dtype))
 
 
-@eqx.filter_jit
 def _at(trajectory: Trajectory, t: Any) -> Any:
     if trajectory.n_impacts.ndim == 0:
         flat = jax.vmap(lambda each: _at_one(trajectory, each))(t.reshape(-1))
@@ -102,6 +102,10 @@ def _at(trajectory: Trajectory, t: Any) -> Any:
         return _at(dataclasses.replace(rest, system=parts[0], motion=parts[1]), t)
 
     return eqx.filter_vmap(one, in_axes=((system_axes, motion_axes), eqx.if_array(0)))(parts, rest)
+
+
+_at_by_default = eqx.filter_jit(_at)
+_at_with_least_effort = with_options(_at, LEAST_EFFORT)
 
 
 def _at_one(trajectory: Trajectory, t: Any) -> Any:

@@ -54,7 +54,7 @@ def sample(trajectory: Any, end: float) -> tuple[Samples, Strikes]:
     begins = np.array([float(trajectory.t0), *untils, *times[trains]])
     ends = np.array([*times, end, *untils[trains]])
     order = np.argsort(begins, kind="stable")
-    per_arc = int(np.clip(900 // len(begins), 24, 100))
+    per_arc = int(np.clip(2400 // len(begins), 24, 100))
     inner = np.linspace(begins, ends, per_arc)[1:-1].T
     asked = np.concatenate([[end], times[trains], inner.ravel()])
     padded = np.full(-(-asked.size // 512) * 512, end)  # few sizes, few compilations

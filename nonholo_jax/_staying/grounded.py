@@ -63,7 +63,6 @@ class Grounded(AbstractSystem):
     hits: bool = eqx.field(static=True)
     curved: bool = eqx.field(static=True)
     may_pass: bool = eqx.field(static=True)  # pyright: ignore[reportIncompatibleVariableOverride]
-    is_long: ClassVar[bool] = False
     may_stay: ClassVar[bool] = True
 
     def __init__(
@@ -78,6 +77,10 @@ class Grounded(AbstractSystem):
         self.scene, self.tolerance, self.parabolic, self.hits = scene, tolerance, parabolic, hits
         self.curved, has_seams = curved, curved and Floors(scene, curved).n_seams > 0
         self.may_pass = has_seams or may_be_flush(scene.surfaces, scene.ball.radius) if may_pass is None else may_pass
+
+    @property
+    def is_long(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.curved
 
     @property
     def names(self) -> tuple[str, ...]:
