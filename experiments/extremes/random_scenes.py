@@ -15,6 +15,7 @@ from nonholo_jax import (
     BallState,
     Box,
     Cylinder,
+    Exact,
     Frictional,
     Plane,
     Rectangle,
@@ -181,7 +182,7 @@ def program(template: Template) -> Callable:
         surfaces = {f"{k}": BUILD[kind](d["surfaces"][k], laws[k]) for k, kind in enumerate(template.surfaces)}
         scene = Scene(Ball(d["radius"], 1.0, d["alpha"]), surfaces, gravity=d["gravity"])
         state = BallState(d["position"], d["velocity"], d["spin"])
-        end = simulate(scene, state, t1=2.0, max_impacts=ROWS, throw=False)
+        end = simulate(scene, state, t1=2.0, max_impacts=ROWS, motion=Exact(), throw=False)
         log = end.impacts
         moving = [(s.position, s.velocity, s.spin) for s in (log.before, log.after, end.final)]
         return end.result._value, end.n_rows, end.t1, log.time, log.until, *moving  # pyright: ignore

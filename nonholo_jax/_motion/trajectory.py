@@ -110,7 +110,7 @@ _at_with_least_effort = with_options(_at, LEAST_EFFORT)
 
 def _at_one(trajectory: Trajectory, t: Any) -> Any:
     """The state at one time of one motion."""
-    system, log = trajectory.system, trajectory.impacts
+    system, log = trajectory.system.engine(t.dtype), trajectory.impacts
     rows = log.time.shape[0]
     end = trajectory.t1
     start, begin, phase = trajectory.initial, trajectory.t0, jnp.asarray(-1, dtype=jnp.int32)

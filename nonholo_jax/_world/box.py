@@ -99,6 +99,8 @@ def _rotation_axes(rotation: Any) -> tuple:
     """The box's own axes in the world frame; exact constants where there is no rotation."""
     if rotation is None:
         return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    if isinstance(rotation, tuple) and len(rotation) == 3:  # known already
+        return rotation
     if isinstance(rotation, tuple) and all(is_constant(c) for c in rotation):
         with jax.ensure_compile_time_eval():
             turn = np.asarray(matrix(rotation), dtype=float)
@@ -267,6 +269,10 @@ class Box(AbstractBlock):
     def face(self, x, t):
         center, half, axes = self._frame()
         return _face(x, center, half, axes, self.faces)
+
+    def engine(self):
+        axes = _rotation_axes(self.rotation)
+        return eqx.tree_at(lambda box: box.rotation, self, axes, is_leaf=lambda x: x is None)
 
     def is_proper(self, radius):
         return [positive("half_size", h) for h in components(self.half_size)]

@@ -155,7 +155,8 @@ class Scene(AbstractSystem):
         return self.struck(contact, time, state)[1]
 
     def engine(self, dtype):
-        return eqx.tree_at(lambda scene: scene.surfaces, self, stacked(self.surfaces, dtype))
+        surfaces = [each.engine() for each in self.surfaces]
+        return eqx.tree_at(lambda scene: scene.surfaces, self, stacked(surfaces, dtype))
 
     def contacts(self):
         starts = itertools.accumulate(self._sizes, initial=0)

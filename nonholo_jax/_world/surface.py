@@ -131,6 +131,10 @@ class AbstractSurface(eqx.Module):
         del n
         return None
 
+    def engine(self) -> "AbstractSurface":
+        """The same surface as the event loop sees it, with what is worth computing only once."""
+        return self
+
     def seams(self) -> Sequence[tuple[Vector3, Vector3, Number]]:
         """Pairs of planes across which the curvature of the surface jumps: the direction across, a point in the middle
         between the two, and half the distance."""
