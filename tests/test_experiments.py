@@ -33,6 +33,8 @@ SMALL = {
     "08": lambda: script("08").checks(("turntable",), steps=2000, step_sizes=0.2 / 2 ** np.arange(4)),
     "09": lambda: script("09").checks((2.5,), (0.6,)),
     "10": lambda: script("10").checks(("wood",)),
+    "11": lambda: script("11").checks(t1=0.6, pivots=(20.0,)),
+    "12": lambda: script("12").checks(n=3, rounds=2, bound=1e-2),
 }
 
 
