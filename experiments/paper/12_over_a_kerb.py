@@ -3,7 +3,7 @@ nor slips, the angular momentum about the edge stays: v+ = v (1 - h / ((1 + alph
 and comes over if (1 + alpha) v+^2 / 2 > g h. So it does on kerbs up to h = r (1 + alpha) / (3 + alpha); from a higher
 one a ball that is fast enough flies off the edge first.
 
-Picture: the slowest speed that climbs, by bisection, against that formula; and three ways."""
+Picture: the slowest speed that climbs, by bisection, against that formula; and how the speed changes on the way."""
 
 import pathlib
 import sys
@@ -81,17 +81,19 @@ def picture() -> None:
     left.set_ylabel("slowest speed that climbs (m/s)", fontsize=9)
     left.legend(fontsize=7.5, frameon=False)
     h = 0.35 * R
-    for factor, colour in ((0.95, INK), (1.02, GREEN), (1.4, BLUE)):
+    for factor, colour in ((0.95, INK), (1.02, GREEN), (1.2, VERMILION)):
         state = rolling(jnp.asarray(factor * slowest(h, 0.4)))
-        out = simulate(street(jnp.asarray(h)), state, t1=1.0, motion=MOTION)
-        path = np.asarray(out.at(jnp.linspace(0.0, 1.0, 400)).position)
-        right.plot(path[:, 0], path[:, 2], color=colour, lw=1.2, label=f"{factor:g} of it")
-    right.fill_between([0.0, 1.0], 0.0, h, color=FAINT, alpha=0.4, lw=0)
+        ends = [simulate(street(jnp.asarray(h)), state, t1=t, motion=MOTION).final for t in np.linspace(0.0, 0.8, 161)]
+        path = np.array([(end.position[0], end.velocity[0]) for end in ends])
+        right.plot(path[:, 0], path[:, 1], color=colour, lw=1.2, label=f"{factor:g} of the slowest that climbs")
+    right.axvline(-np.sqrt(R**2 - (R - h) ** 2), color=FAINT, lw=0.8, ls=":")
+    right.axvspan(0.0, 0.3, color=FAINT, alpha=0.3, lw=0)
+    right.text(0.15, 0.03, "on the kerb", fontsize=8, ha="center")
     right.axhline(0.0, color=FAINT, lw=0.8)
-    right.set(xlim=(-0.4, 0.6), ylim=(-0.01, 0.25), aspect="equal")
+    right.set(xlim=(-0.25, 0.3))
     right.set_xlabel("x of the centre (m)", fontsize=9)
-    right.set_ylabel("z (m)", fontsize=9)
-    right.legend(fontsize=7.5, frameon=False)
+    right.set_ylabel("speed along x (m/s)", fontsize=9)
+    right.legend(fontsize=7.5, frameon=False, loc="upper right")
     save(new, NAME)
 
 
