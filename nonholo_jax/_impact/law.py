@@ -2,7 +2,7 @@
 velocity by 1 + e_n and of the slip by s, so that a law is just the pair (e_n, s)."""
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 
@@ -24,7 +24,7 @@ class AbstractContactLaw(eqx.Module):
         """The share e_t of its slip that an impact reverses if it grips; `None` where there is no such number."""
         return None
 
-    def resistance(self) -> tuple[Number, Number]:
+    def resistance(self) -> tuple[Any, Any]:
         """The coefficients of rolling resistance and of spinning friction of a ball that stays on the surface."""
         return 0.0, 0.0
 
@@ -106,7 +106,7 @@ class Rough(AbstractContactLaw):
             checks.append(_within("tangential", self.tangential, -1.0, 1.0, "1 reverses the slip, -1 keeps it"))
         return [*checks, *_resists(self)]
 
-    def resistance(self) -> tuple[Number, Number]:
+    def resistance(self) -> tuple[Any, Any]:
         return self.rolling, self.spinning
 
     def slip_factor(self, inertia_ratio: Number, closing_speed: Number, slip_squared: Number) -> Number:
@@ -182,7 +182,7 @@ class Frictional(AbstractContactLaw):
         tangential = _within("tangential", self.tangential, -1.0, 1.0, "1 reverses the slip, -1 keeps it")
         return [*super().admissible(), tangential, (self.friction >= 0, sentence), *_resists(self)]
 
-    def resistance(self) -> tuple[Number, Number]:
+    def resistance(self) -> tuple[Any, Any]:
         return self.rolling, self.spinning
 
     def slip_factor(self, inertia_ratio: Number, closing_speed: Number, slip_squared: Number) -> Number:

@@ -143,7 +143,7 @@ class Integrated(AbstractMotion):
         return _Control(frozen(jnp.asarray(size, dtype=time.dtype)), jax.tree.map(jnp.asarray, memo)), memory
 
     def shortened(self, control, size):
-        return control if self._is_constant else control._replace(size=size)
+        return None if self._is_constant else control._replace(size=size)
 
     @property
     def steps(self) -> bool:

@@ -340,9 +340,11 @@ def _ending_there(
     them, the step is not kept, and the next one ends just behind it."""
     if system.n_derived == 0:
         return kept, control
+    shortened = motion.shortened(control, (1.0 + 1e-5) * frozen(found.s * arc.unit))
+    if shortened is None:
+        return kept, control
     inside = (found.s > 1e-3 * arc.length) & (found.s < 0.99 * arc.length)
     early = stays & kept & found.finished & (found.contact >= 0) & inside
-    shortened = motion.shortened(control, (1.0 + 1e-5) * frozen(found.s * arc.unit))
     return kept & ~early, keep(early, shortened, control)
 
 

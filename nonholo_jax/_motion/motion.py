@@ -60,7 +60,7 @@ class AbstractMotion(eqx.Module):
         """The size in seconds of the next arc; `stays` says that the system is in contact all along."""
 
     def shortened(self, control: Any, size: Scalar) -> Any:
-        """The control for a next arc of that size."""
+        """The control for a next arc of that size; `None` where all are of one size."""
         del size
         return control
 
