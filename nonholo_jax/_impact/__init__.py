@@ -1,7 +1,6 @@
 """What an impact does to velocities: the projector, contact laws, corners, trains of bounces, rolling and sliding."""
 
-from . import rolling as rolling, train as train
-from .groove import Sides as Sides
+from . import groove as groove, rolling as rolling, train as train
 from .law import AbstractContactLaw as AbstractContactLaw, Frictional as Frictional, Rough as Rough, Smooth as Smooth
 from .projector import (
     accelerate as accelerate,

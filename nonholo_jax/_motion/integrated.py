@@ -47,8 +47,8 @@ class Integrated(AbstractMotion):
     - `max_steps`: bound on the number of accepted steps (arcs, each cut short by an impact included), after which the
         result is `step_limit`.
     - `edges`: whether a ball that stays on a surface also goes on over the edges and corners of boxes and plates, and
-        rests or rolls on elastic surfaces; this makes a longer program. `None`: where the scene has a sphere, a
-        cylinder or an `Implicit` to stay on, on which it rolls in any case.
+        rests or rolls on elastic surfaces and the outside of round ones; this makes a longer program. `None`: where the
+        scene has the inside of a sphere or a cylinder, or an `Implicit`, that is not elastic.
     - `unroll`: speed only. Whether the stages of a step are written out one after the other, over scalars, which is
         quicker in batches and takes longer to compile; `None` does so in batches of balls.
     - `safe_steps`, `tile`: speed only. How often one turn of the event loop may look ahead for a crossing, and how many
