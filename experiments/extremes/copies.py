@@ -155,7 +155,7 @@ def compared(family: str, law: str, n: int, dtype: Any, seed: int) -> tuple[int,
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--scenes", type=int, default=20_000, help="in each family")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="families with this in their name")

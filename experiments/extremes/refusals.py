@@ -95,7 +95,7 @@ def study(template: Template, throws: int, motion: Any, batch: int = 1024, seed:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])  # pyright: ignore
+    parser = argparse.ArgumentParser(description=str(__doc__).split("\n\n")[0])
     parser.add_argument("--throws", type=int, default=100_000, help="in each family")
     parser.add_argument("--plain", action="store_true", help="with Exact() alone")
     parser.add_argument("--only", default="", help="families with this in their name")

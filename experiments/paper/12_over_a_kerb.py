@@ -30,7 +30,8 @@ def slowest(h: Any, alpha: Any) -> Any:
 
 def street(h: Any, alpha: Any = 0.4) -> Scene:
     law = Rough(0.0)
-    floor, kerb = Plane((0, 0, 0), (0, 0, 1), law), Box(jnp.stack([1.0 + 0 * h, 0 * h, h - 1.0]), (1.0, 1.0, 1.0), law)
+    floor = Plane((0, 0, 0), (0, 0, 1), law)
+    kerb = Box(center=jnp.stack([1.0 + 0 * h, 0 * h, h - 1.0]), half_size=(1.0, 1.0, 1.0), law=law)
     return Scene(Ball(R, 1.0, alpha), {"floor": floor, "kerb": kerb})
 
 
