@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from random_scenes import BUILD, NAMES_OF_RESULTS, Template, admissible, gaps
 
-from nonholo_jax import Ball, BallState, Exact, Integrated, Rough, Scene, simulate
+from nonholo_jax import Ball, BallState, Exact, Frictional, Integrated, Rough, Scene, simulate
 
 sys.path.append(str(pathlib.Path(__file__).parents[1]))  # for report.py
 from report import machine
@@ -36,11 +36,21 @@ def _losing(u: Any) -> Any:
     return Rough(0.9 * u[0])
 
 
-FAMILIES = (
-    Template("bowl with a post", ("bowl", "post"), _losing),
-    Template("pipe with a box", ("pipe", "box"), _losing),
-    Template("floor with wall and box", ("plane", "plane", "box"), _losing),
-    Template("Galton board", ("plane", "post", "post", "post", "post"), _losing),
+def _rubbing(u: Any) -> Any:
+    """The same with friction, from none to more than any that is known."""
+    return Frictional(0.9 * u[0], 0.5 * u[1], u[2])
+
+
+SHAPES = {
+    "bowl with a post": ("bowl", "post"),
+    "pipe with a box": ("pipe", "box"),
+    "floor with wall and box": ("plane", "plane", "box"),
+    "Galton board": ("plane", "post", "post", "post", "post"),
+}
+FAMILIES = tuple(
+    Template(f"{name}, {kind}", shapes, law)
+    for name, shapes in SHAPES.items()
+    for kind, law in (("rough", _losing), ("friction", _rubbing))
 )
 
 
@@ -103,7 +113,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     motion = Exact() if options.plain else Exact(contact=Integrated(rtol=TOLERANCE, atol=TOLERANCE))
-    print(f"{machine()}\n{'':25} {'throws':>7} {'refused':>8} {'depth':>8} {'energy':>8}  results")
+    print(f"{machine()}\n{'':33} {'throws':>7} {'refused':>8} {'depth':>8} {'energy':>8}  results")
     rows, fine = {}, True
     for template in FAMILIES:
         if options.only not in template.name:
@@ -115,7 +125,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         fine &= sound
         sizes = f"{found.throws:7} {found.refused / found.throws:8.5f} {found.depth:8.1e} {found.gained:8.1e}"
         verdict = "" if sound else " FAIL"
-        print(f"{template.name:25} {sizes}  {counts}{verdict}  ({time.monotonic() - begun:.0f} s)", flush=True)
+        print(f"{template.name:33} {sizes}  {counts}{verdict}  ({time.monotonic() - begun:.0f} s)", flush=True)
         rows[template.name] = found._asdict()
     if options.json:
         options.json.write_text(json.dumps({"machine": machine(), "families": rows}, indent=1))

@@ -19,7 +19,7 @@ from .._world import AbstractSystem, Meeting
 from .crossing import crossing_time, search
 from .motion import AbstractMotion
 
-_MOST_IMPACTS_AT_ONCE = 32
+_MOST_IMPACTS_AT_ONCE = 128
 _FEW_ROWS = 64
 
 

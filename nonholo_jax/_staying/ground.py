@@ -18,13 +18,12 @@ from .._math import (
     components,
     cross,
     dot,
-    frozen,
     norm,
     plus,
     ratio,
+    root,
     scale,
     subtract,
-    total,
     where,
     where_vector,
 )
@@ -53,6 +52,15 @@ class Brake(NamedTuple):
     holds: Any  # whether resistance holds it
 
 
+class Slides(NamedTuple):
+    """How a ball in a groove slips on its two sides."""
+
+    grips: tuple[Any, Any]  # whether it does not
+    headings: tuple[Vector3, Vector3]  # in which direction it does, against friction; or zero
+    straight: tuple[Any, Any]  # whether it keeps that direction until its slip ends
+    limits: tuple[Number, Number]  # the coefficients of friction
+
+
 class Ground(NamedTuple):
     """What a ball that stays on a face has below it."""
 
@@ -68,6 +76,7 @@ class Ground(NamedTuple):
     pivot: Number = 0.0  # the spin about the normal of a ball that rolls on a curved surface
     seams: tuple = ()  # for each pair of seams whether the ball is beyond it, and what `Floors.seam` says
     brake: Brake | None = None  # `None` where nothing resists rolling
+    slides: Slides | None = None  # only where there are grooves with friction
     spinning: tuple | None = None  # the coefficient of what resists spinning about the normal, and against which sign
 
 
@@ -165,6 +174,16 @@ class Footing:
         return self.curved and self.scene.n_contacts > 1
 
     @property
+    def end_of_slips(self) -> int:
+        """The first of the contacts at which the slips on both sides of a groove have died out."""
+        return self.end_of_hold + self.n_holds
+
+    @property
+    def n_derived(self) -> int:
+        """How many numbers that follow from the motion are followed like a part of it."""
+        return self.n_holds + 2 * (self.have_grooves and self.floors.have_friction)
+
+    @property
     def n_holds(self) -> int:
         """How many pushes are followed."""
         return self.follows_hold + self.have_grooves
@@ -181,32 +200,15 @@ class Footing:
         grips = [self.floors.rolls(choice) for choice in choices]
         return groove.Sides(tuple(normals), tuple(turns), tuple(jnp.asarray(g) for g in grips))  # pyright: ignore
 
-    def along_groove(
-        self, time: Any, state: Travel, q: tuple, v: tuple
-    ) -> tuple[groove.Sides, groove.Way, groove.Course]:
-        """How a ball goes along a groove."""
-        ball, x, (_, pivot) = self.scene.ball, q[:3], self.inner(q)
-        sides = self.sides(time, state, x, v)
-        path = groove.way(ball.radius, sides)
-        spin = groove.spin_of(path, dot(path.along, v), pivot, state.flight.spin, sides.grips[0] | sides.grips[1])
-        a, b, c = self.scene.derivative(time, state.flight._replace(spin=spin), x, v)[1]
-        pull = (jnp.asarray(a, time.dtype), jnp.asarray(b, time.dtype), jnp.asarray(c, time.dtype))
-        return sides, path, groove.course(ball.radius, ball.inertia_ratio, sides, v, pivot, pull)
-
-    def holds_in_groove(self, state: Travel, sides: Any, course: Any) -> list[Number]:
-        """`derived` on both sides of a groove."""
-        size = frozen(total([abs(push) for push in course.pushes]))
-        holds, floors = [], self.floors
-        for i, push, force in zip((phase_of(state), second_of(state)), course.pushes, course.forces, strict=True):
-            hold = ratio(self.scene.ball.radius * push, size)
-            if floors.have_friction:
-                friction = floors.friction(self.scene.choice(i))
-                limited = jnp.isfinite(friction) & floors.rolls(self.scene.choice(i))
-                most, used = where(limited, friction, 0.0) * push, dot(force, force)
-                spare = ratio(self.scene.ball.radius * (most * abs(most) - used), frozen(most * most + used))
-                hold = where(limited & (used > 0), spare, hold)
-            holds.append(hold)
-        return holds
+    def limits(self, state: Travel) -> tuple[Number, Number]:
+        """The coefficients of friction on both sides of a groove: infinite where a ball cannot slip, zero where nothing
+        holds it."""
+        one, two = (self.scene.choice(i) for i in (phase_of(state), second_of(state)))
+        floors = self.floors
+        return (
+            where(floors.rolls(one), floors.friction(one), 0.0),
+            where(floors.rolls(two), floors.friction(two), 0.0),
+        )
 
     def ground(self, time: Any, state: Travel) -> Ground:
         flight, floors, on = state.flight, self.floors, state.support >= 0
@@ -243,6 +245,8 @@ class Footing:
             slides = slides & (second_of(state) < 0)
         slip = rolling.own_slip(ball.radius, n, flight.velocity, flight.spin)
         slip = where_vector(slides, slip, rolling.NONE)
+        if self.have_grooves:
+            more["slides"] = self._slides(time, state)
         drive = subtract(along, twist)
         if brake is not None:
             drive = add(drive, scale(where(dot(slip, slip) > 0, 0.0, 1.0 + 1.0 / alpha), slowed))
@@ -253,7 +257,32 @@ class Footing:
             slides = dot(heading, heading) > 0
             brake = brake._replace(coefficient=where(slides, 0.0, brake.coefficient), holds=brake.holds & ~slides,
                                    heading=where_vector(slides, rolling.NONE, brake.heading))  # fmt: skip
+        if self.follows_hold and not self.parabolic:
+            begins = (dot(heading, heading) > 0) & (dot(slip, slip) == 0)
+            slip = where_vector(begins, scale(self.first_slip(flight), heading), slip)
+        if self.have_grooves:  # there it is the spin that is followed
+            slip = where_vector(second_of(state) >= 0, scale(ball.radius, flight.spin), slip)
         return Ground(face, edged, rolls, friction, free, slip, heading, straight, flush, brake=brake, **more)
+
+    def first_slip(self, flight: Flight) -> Number:
+        """The slip with which one begins: so large that it does not end at once where friction hardly fails to hold it,
+        as far as that is known to rounding and to the tolerance of a step."""
+        eps, radius = float(jnp.finfo(jnp.result_type(*flight.position)).eps), self.scene.ball.radius
+        size = norm(flight.velocity) + radius * norm(flight.spin) + root(radius * norm(components(self.scene.gravity)))
+        return 4.0 * self.tolerance * (1.0 + size) + max(eps**0.75, 1024.0 * eps) * size
+
+    def _slides(self, time: Any, state: Travel) -> Slides:
+        flight, radius, limits = state.flight, self.scene.ball.radius, self.limits(state)
+        sides = self.sides(time, state, flight.position, flight.velocity)
+        slips = groove.slips(radius, sides, flight.velocity, flight.spin)
+        grips, headings, straight = [], [], []
+        for slip, limit in zip(slips, limits, strict=True):
+            speed, firm = norm(slip), jnp.isinf(jnp.asarray(limit))
+            slides = (speed > 0) & ~firm & (limit > 0) & (second_of(state) >= 0)
+            grips.append(firm | ((speed == 0) & (limit > 0)))
+            headings.append(where_vector(slides, scale(ratio(1.0, speed), slip), rolling.NONE))
+            straight.append(speed <= 100.0 * self.tolerance)
+        return Slides((grips[0], grips[1]), (headings[0], headings[1]), (straight[0], straight[1]), limits)
 
     def _brake(
         self, support: Choice, flight: Flight, n: Vector3, push: Number, along: Vector3, rolls: Any

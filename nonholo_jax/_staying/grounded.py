@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._impact import groove, rolling, train
+from .._impact import rolling, train
 from .._math import (
     KINDS,
     Hopper,
@@ -105,7 +105,7 @@ class Grounded(AbstractSystem):
     @property
     def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
         settling = self._settling
-        return (settling.end_of_hold + settling.n_holds) if self.hits else 0
+        return (settling.end_of_hold + settling.n_derived) if self.hits else 0
 
     def engine(self, dtype):
         return dataclasses.replace(self, scene=self.scene.engine(dtype))
@@ -171,14 +171,16 @@ class Grounded(AbstractSystem):
             lost = rolling.spin_loss(self.scene.ball, coefficient, -forced.push)
             spun = where((sign == 0) & (coefficient > 0), 0.0, spun - sign * lost)
         if settling.have_grooves:
-            inside, (_, _, course) = second_of(state) >= 0, settling.along_groove(time, state, q, v)
+            inside, (_, _, course) = second_of(state) >= 0, settling.along_groove(time, state, below, q, v)
             rate, spun = where_vector(inside, course.acceleration, rate), where(inside, course.pivots, spun)
+            if slip:
+                changes = where_vector(inside, scale(self.scene.ball.radius, course.spins), changes)
             slows = tuple(where(inside, 0.0, each) for each in slows)
         return (*v, *changes, spun, *slows), rate
 
     @property
     def n_derived(self) -> int:
-        return self._settling.n_holds if self.hits else 0
+        return self._settling.n_derived if self.hits else 0
 
     @property
     def degree_of_derived(self) -> int:
@@ -204,9 +206,9 @@ class Grounded(AbstractSystem):
             hold = where(limited, spare, hold)
         if not settling.have_grooves:
             return (where(on, hold, 1.0),)
-        inside, (sides, _, course) = second_of(state) >= 0, settling.along_groove(time, state, q, v)
-        first, second = settling.holds_in_groove(state, sides, course)
-        return where(on, where(inside, first, hold), 1.0), where(inside, second, 1.0)
+        inside, (sides, spin, course) = second_of(state) >= 0, settling.along_groove(time, state, below, q, v)
+        first, *others = settling.ends_in_groove(state, below, sides, spin, v, course)
+        return where(on, where(inside, first, hold), 1.0), *[where(inside, x, 1.0) for x in others]
 
     def rate_of(self, time, state):
         return state.flight.velocity
@@ -223,10 +225,7 @@ class Grounded(AbstractSystem):
             still = where_vector(below.rolls, scale(pivot, n), free.spin)
             slip = rolling.along_surface(n, slip) if slip else slip
             if settling.have_grooves:
-                sides = settling.sides(time, state, flight.position, v)
-                path, inside = groove.way(self.scene.ball.radius, sides), second_of(state) >= 0
-                grips = sides.grips[0] | sides.grips[1]
-                in_groove = groove.spin_of(path, dot(path.along, v), pivot, state.flight.spin, grips)
+                inside, in_groove = second_of(state) >= 0, settling.spin_in_groove(time, state, below, flight, q)
         elif below.spinning is not None:
             still = self._spun_down(time, state, below, duration)
         spin = add(still, scale(free.turning, cross(n, subtract(v, slip) if slip else v)))
@@ -234,6 +233,7 @@ class Grounded(AbstractSystem):
         if orientation is not None:
             turning = subtract(state.flight.velocity, below.slip)
             before = add(free.spin, scale(free.turning, cross(below.face.normal, turning)))
+            before = where_vector(inside, state.flight.spin, before) if settling.have_grooves else before
             turned = rolled(state.flight.orientation, before, spin, duration, orientation.dtype)
             orientation = jnp.where(below.rolls, turned, orientation)
         return Travel(flight._replace(spin=spin, orientation=orientation), state.support)
@@ -261,7 +261,9 @@ class Grounded(AbstractSystem):
         name = where(contact.index >= self._n_surfaces, self.phase(state), contact.index)
         if not self._settling.have_grooves:
             return name
-        return where(contact.index == self._settling.end_of_hold + 1, second_of(state), name)
+        settling = self._settling
+        beside = (contact.index == settling.end_of_hold + 1) | (contact.index == settling.end_of_slips + 1)
+        return where(beside, second_of(state), name)
 
     def code(self, state):
         if not self._settling.have_grooves:
@@ -277,7 +279,9 @@ class Grounded(AbstractSystem):
     def left_by(self, contact):
         if not self._settling.follows_hold:
             return 0
-        return where(contact.index >= self._settling.end_of_hold, np.int32(self.n_contacts), np.int32(0))
+        settling, index = self._settling, contact.index
+        holds = (index >= settling.end_of_hold) & (index < settling.end_of_slips)
+        return where(holds, np.int32(self.n_contacts), np.int32(0))
 
     def _below(self, time: Any, state: Travel) -> Ground:
         return self._settling.ground(time, state) if state.below is None else state.below
@@ -306,7 +310,7 @@ class Grounded(AbstractSystem):
             return where(dot(heading, heading) > 0, dot(heading, q[3:6]), 1.0)
         settling = self._settling
         if contact >= settling.end_of_hold:
-            return q[contact - settling.end_of_hold - settling.n_holds]
+            return q[contact - settling.end_of_hold - settling.n_derived]
         if contact >= settling.end_of_roll:
             sign, k = self._dying(contact, time, state)
             unit = 1.0 if contact == settling.end_of_roll else self.scene.ball.radius
@@ -368,7 +372,7 @@ class Grounded(AbstractSystem):
             bend = window._replace(coefficients=window.coefficients[3:6]).along(heading, rolling.NONE).bend
             skip = dot(heading, heading) == 0
         elif contact >= self._settling.end_of_hold:
-            k = contact - self._settling.end_of_hold - self._settling.n_holds
+            k = contact - self._settling.end_of_hold - self._settling.n_derived
             bend, skip = window.track(window.coefficients[k]).bend, phase_of(state) < 0
         elif contact >= self._settling.end_of_roll:
             sign, k = self._dying(contact, time, state)

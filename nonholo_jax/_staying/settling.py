@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .._impact import groove, rolling, train
+from .._impact import rolling, train
 from .._math import (
     KINDS,
     RESULTS,
@@ -28,7 +28,8 @@ from .._math import (
     where_vector,
 )
 from .._world import Face, Flight, Meeting, Member, Neighbours, Support, magnitude, neighbours, numbers_of, rounding
-from .ground import Footing, Travel, phase_of, second_of, support_of
+from .grooved import Entry, Grooved
+from .ground import Travel, phase_of, second_of
 
 
 class Touch(NamedTuple):
@@ -50,10 +51,11 @@ class Touch(NamedTuple):
     grips: Any  # whether all of them grip
     on: Any  # whether the ball was on a face before, and is not thrown off it
     onto: Any  # the surface onto which it passes, or -1; `None` where no faces are flush
+    entry: Entry | None = None  # where there are grooves
     turn: Vector3 | None = None  # how fast the normal of a curved surface turns as the ball goes along
 
 
-class Settling(Footing):
+class Settling(Grooved):
     """What a ball does that comes to a surface to stay on, or meets something there."""
 
     def _onto(self, index: Any, found: Neighbours, time: Any) -> Any:
@@ -95,8 +97,9 @@ class Settling(Footing):
                 onto = where(is_seam & (onto < 0) & (first.pull > 0), phase_of(state), onto)
         law = floors.law(floor)
         slips, grips = self._regime(first, law)
+        entry = self.enter(contact, time, state, on, self.pull) if self.have_grooves else None
         return Touch(
-            contact, time, state, n, struck, pull, floor, face, edged, first, law, slips, grips, on, onto, turn
+            contact, time, state, n, struck, pull, floor, face, edged, first, law, slips, grips, on, onto, entry, turn
         )
 
     def struck(self, contact: Choice, time: Any, state: Travel) -> tuple[Vector3, Flight, Any]:
@@ -184,7 +187,10 @@ class Settling(Footing):
         contact, on, first, law = touch.contact, touch.on, touch.first, touch.law
         is_exit = contact.index >= self.scene.n_contacts
         grips = (contact.index == self.end_of_slip) & self.floors.have_friction
-        lifts = (contact.index >= self.end_of_hold) if self.follows_hold else False
+        lifts: Any = False
+        if self.follows_hold:
+            lifts = (contact.index >= self.end_of_hold) & (contact.index < self.end_of_slips)
+            grips = grips | (contact.index >= self.end_of_slips)
         is_floor = self.floors.include(contact) & touch.face.below & (first.pull > 0)
         lasts, clear, sums = self._sums(touch)
         capped = law.rolls & jnp.isfinite(jnp.inf if law.friction is None else law.friction)
@@ -204,8 +210,11 @@ class Settling(Footing):
         if self.follows_hold and self.floors.have_friction:
             over = KINDS.where(jnp.asarray(lifts) & self._begins_to_slip(touch), KINDS.slipped, over)
         kind = KINDS.where(on, KINDS.where(is_exit, over, KINDS.rolling), bounce_or_end)
-        enters, slips_there, cornered = self._in_groove(touch, rests) if self.have_grooves else (False, False, False)
-        kind = KINDS.where(jnp.asarray(enters) | cornered, KINDS.groove, kind) if self.have_grooves else kind
+        enters, cornered = False, False
+        if self.have_grooves:
+            enters, slips_there, cornered = self.in_groove(touch, rests)
+            kind = KINDS.where(slips_there, KINDS.slipped, kind)
+            kind = KINDS.where(enters | cornered, KINDS.groove, kind)
         passes = touch.onto >= 0 if self.joins else False
         kind = KINDS.where(passes, KINDS.passed, kind) if self.joins else kind
 
@@ -214,7 +223,7 @@ class Settling(Footing):
         stuck = ~is_exit & where(on, rests & ~wedged, ends & ~is_floor)
         stuck = stuck & ~passes if self.joins else stuck
         if self.have_grooves:
-            stuck, is_at_rest = (stuck & ~enters & ~cornered) | slips_there, is_at_rest | cornered
+            stuck, is_at_rest = stuck & ~enters & ~cornered, is_at_rest | cornered
         fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
         fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
         goes = is_exit & ~grips & ~jnp.asarray(lifts) & ~jnp.asarray(stops)
@@ -229,61 +238,6 @@ class Settling(Footing):
             bends = (after.support >= 0) & ~straight
             fault = RESULTS.where(bends, RESULTS.curved_slide, fault)
         return Meeting(kind, fault, after, pause, is_at_rest)
-
-    def _in_groove(self, touch: Touch, rests: Any) -> tuple[Any, Any, Any]:
-        """Whether a ball on one surface goes on along the groove that another one makes with it; whether one in a
-        groove would have to slip, which is not followed; and whether a third surface holds it in a corner."""
-        state, index, on = touch.state, touch.contact.index, touch.on
-        flight, time, eps = state.flight, touch.time, float(jnp.finfo(touch.time.dtype).eps)
-        alone, is_met = second_of(state) < 0, index < self.scene.n_contacts
-        beside = where(alone & is_met, index, second_of(state))
-        joined = state._replace(support=support_of(phase_of(state), beside, time.dtype))
-        sides, path, course, speed, pivot = self._entry(touch, joined)
-        size = norm(touch.pull) + norm(course.acceleration)
-        pressed = (course.pushes[0] > eps * size) & (course.pushes[1] > eps * size)
-        fits = on & is_met & alone & rests & self.floors.include(touch.contact)
-        spin = groove.spin_of(path, speed, pivot, flight.spin, sides.grips[0] | sides.grips[1])
-        enters = fits & pressed & self._can_grip(joined, course, spin, speed)
-        third = tuple(jnp.asarray(c, time.dtype) for c in touch.normal)
-        one, two = sides.normals
-        into = scale(-1.0, self.pull(time, flight))
-        volume = dot(cross(one, two), third)
-        parts = [ratio(dot(cross(a, b), c), volume)
-                 for a, b, c in ((into, two, third), (one, into, third), (one, two, into))]  # fmt: skip
-        held = (parts[0] >= 0) & (parts[1] >= 0) & (parts[2] >= 0) & (abs(volume) > eps**0.5)
-        still = (sides.grips[0] | sides.grips[1]) & (self.scene.air is None)
-        cornered = on & is_met & ~alone & rests & held & still
-        over = (index >= self.end_of_hold) & ~alone & on
-        push = where(index == self.end_of_hold, course.pushes[0], course.pushes[1])
-        return enters, over & (push > eps**0.5 * size), cornered
-
-    def _entry(self, touch: Touch, joined: Travel) -> tuple:
-        """A groove as a ball comes into it: its sides, its way, how it goes there, its speed and its free spin."""
-        flight, ball, time = joined.flight, self.scene.ball, touch.time
-        sides = self.sides(time, joined, flight.position, flight.velocity)
-        path = groove.way(ball.radius, sides)
-        speed, pivot = groove.entered(ball.radius, ball.inertia_ratio, path, flight.velocity, flight.spin)
-        along = scale(speed, path.along)
-        sides = self.sides(time, joined, flight.position, along)
-        spin = groove.spin_of(path, speed, pivot, flight.spin, sides.grips[0] | sides.grips[1])
-        x, y, z = self.pull(time, flight._replace(velocity=along, spin=spin))
-        pull = (jnp.asarray(x, time.dtype), jnp.asarray(y, time.dtype), jnp.asarray(z, time.dtype))
-        course = groove.course(ball.radius, ball.inertia_ratio, sides, along, pivot, pull)
-        return sides, path, course, speed, pivot
-
-    def _can_grip(self, joined: Travel, course: groove.Course, spin: Vector3, speed: Number) -> Any:
-        """Whether friction can hold a ball in a groove, into which it comes without slip, and nothing resists it."""
-        flight, radius, floors, grips = joined.flight, self.scene.ball.radius, self.floors, True
-        for i, push, force in zip((phase_of(joined), second_of(joined)), course.pushes, course.forces, strict=True):
-            floor = self.scene.choice(i)
-            if floors.resist[0]:
-                grips = grips & ~(floors.resistance(floor, 0) > 0)
-            if floors.have_friction:
-                friction, rolls = floors.friction(floor), floors.rolls(floor)
-                slow = norm(subtract(flight.spin, spin)) * radius <= 1e-3 * (abs(speed) + radius * norm(spin))
-                holds = slow & (dot(force, force) <= (friction * push) ** 2)
-                grips = grips & (~(rolls & jnp.isfinite(friction)) | holds)
-        return grips
 
     def _stopped(self, touch: Touch) -> tuple[Vector3, Vector3]:
         """Velocity and spin of a ball whose rolling, or spinning about the normal, has died out."""
@@ -311,12 +265,10 @@ class Settling(Footing):
     def _slipping(self, touch: Touch) -> tuple[Vector3, Vector3]:
         """Velocity and spin of a ball that begins to slip: a little, so that rounding does not hide the direction."""
         flight, ball, n = touch.state.flight, self.scene.ball, touch.face.normal
-        eps = float(jnp.finfo(touch.time.dtype).eps)
         drive = rolling.along_surface(n, touch.pull)
         if touch.turn is not None:
             drive = subtract(drive, rolling.twist(ball.radius, dot(n, flight.spin), n, touch.turn))
-        size = eps**0.75 * (norm(flight.velocity) + ball.radius * norm(flight.spin))
-        slip = scale(ratio(size, norm(drive)), drive)
+        slip = scale(ratio(self.first_slip(flight), norm(drive)), drive)
         return flight.velocity, rolling.rolling_spin(ball.radius, n, subtract(flight.velocity, slip), flight.spin)
 
     def _tips(self, touch: Touch) -> Any:
@@ -363,7 +315,7 @@ class Settling(Footing):
         )
         surface, support = touch.contact.index.astype(touch.time.dtype), touch.state.support
         if self.have_grooves:
-            enters, support, after = self._beside(touch, kind, after)
+            enters, support, after = self.beside(touch, kind, after)
             stays = stays | enters
         support = where(settles, surface, where(stays, support, -1.0))
         if self.joins:
@@ -375,24 +327,6 @@ class Settling(Footing):
             after = self.placed(touch.time, support, after)
         at_rest = (settles | stays) & self._is_still(touch, after, held)
         return Travel(after, support), where(settles, end.time, 0.0), wedged, at_rest
-
-    def _beside(self, touch: Touch, kind: KINDS, after: Flight) -> tuple[Any, Any, Flight]:
-        """Whether a ball stays that comes into a groove, or out of one onto one of its sides; its support; its state.
-        An impact on a third surface takes it off the second one, to which it comes back."""
-        state, index, dtype = touch.state, touch.contact.index, touch.time.dtype
-        first, second = phase_of(state), second_of(state)
-        enters, left = kind == KINDS.groove, (kind == KINDS.left) & (second >= 0) & (index >= self.end_of_hold)
-        joined = state._replace(support=support_of(first, where(second >= 0, second, index), dtype))
-        sides, path, _, speed, pivot = self._entry(touch, joined)
-        spin = groove.spin_of(path, speed, pivot, state.flight.spin, sides.grips[0] | sides.grips[1])
-        rests = enters & (second >= 0)  # in a corner
-        after = after._replace(
-            velocity=where_vector(enters, where_vector(rests, rolling.NONE, scale(speed, path.along)), after.velocity),
-            spin=where_vector(enters, where_vector(rests, rolling.NONE, spin), after.spin),
-        )
-        alone = where(left & (index == self.end_of_hold), second, first).astype(dtype)
-        goes_on = (index >= self.scene.n_contacts) & ~left
-        return enters | left, where(enters, joined.support, where(goes_on, state.support, alone)), after
 
     def _passed(self, passed: Any, onto: Any, touch: Touch, after: Flight) -> Flight:
         """The state of a ball that has passed onto a flush face: as it was, but where it cannot slip it rolls."""

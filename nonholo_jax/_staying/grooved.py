@@ -1,0 +1,194 @@
+"""A ball in the groove between two surfaces: how it goes, what ends there, and how it comes in and out."""
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax.numpy as jnp
+
+from .._impact import groove, rolling
+from .._math import (
+    KINDS,
+    Number,
+    Vector3,
+    cross,
+    dot,
+    frozen,
+    norm,
+    ratio,
+    scale,
+    total,
+    where,
+    where_vector,
+)
+from .._world import Flight
+from .ground import Footing, Ground, Travel, phase_of, second_of, support_of
+
+if TYPE_CHECKING:
+    from .settling import Touch
+
+
+class Entry(NamedTuple):
+    """How a ball goes on along the groove of its support and what it meets, or of the two surfaces that it is on."""
+
+    joined: Travel
+    held: tuple[Any, Any]  # on which sides the ball did not slip before
+    path: groove.Way
+    course: groove.Course
+    speed: Number
+    spin: Vector3
+
+
+class Grooved(Footing):
+    """What a ball does in a groove."""
+
+    def along_groove(
+        self, time: Any, state: Travel, below: Ground, q: tuple, v: tuple
+    ) -> tuple[groove.Sides, Vector3, groove.Course]:
+        """How a ball goes along a groove: its sides, its spin, and what changes them."""
+        ball, x = self.scene.ball, q[:3]
+        sides = self.sides(time, state, x, v)
+        rub, kept, pivot = None, state.flight.spin, self.inner(q)[1]
+        if below.slides is not None:
+            sides, kept = sides._replace(grips=below.slides.grips), scale(ratio(1.0, ball.radius), q[3:6])
+        path = groove.way(ball.radius, sides)
+        if below.slides is not None:
+            pivot = dot(path.free, kept)
+        spin = groove.spin_of(path, dot(path.along, v), pivot, kept, sides.grips[0] | sides.grips[1])
+        if below.slides is not None:
+            rub = groove.Rub(below.slides.limits, self._headings(below, groove.slips(ball.radius, sides, v, spin)))  # pyright: ignore
+        pull = self._arrays(self.scene.derivative(time, state.flight._replace(spin=spin), x, v)[1], time)
+        return sides, spin, groove.course(ball.radius, ball.inertia_ratio, sides, v, spin, pull, rub)  # pyright: ignore
+
+    def spin_in_groove(self, time: Any, state: Travel, below: Ground, flight: Flight, q: tuple) -> Vector3:
+        """The spin of a ball that has come to `flight` at the configuration `q`."""
+        radius, kept, (_, pivot) = self.scene.ball.radius, state.flight.spin, self.inner(q)
+        sides = self.sides(time, state, flight.position, flight.velocity)
+        if below.slides is not None:
+            sides, kept = sides._replace(grips=below.slides.grips), scale(ratio(1.0, radius), q[3:6])
+        path = groove.way(radius, sides)
+        if below.slides is not None:
+            pivot = dot(path.free, kept)
+        return groove.spin_of(path, dot(path.along, flight.velocity), pivot, kept, sides.grips[0] | sides.grips[1])
+
+    @staticmethod
+    def _arrays(a: Vector3, time: Any) -> Vector3:
+        x, y, z = a
+        return jnp.asarray(x, time.dtype), jnp.asarray(y, time.dtype), jnp.asarray(z, time.dtype)
+
+    @staticmethod
+    def _headings(below: Ground, slips: tuple) -> tuple[Vector3, Vector3]:
+        """The directions of the slips on both sides, some time after the arc began."""
+        assert below.slides is not None
+        found = []
+        for slip, known, straight in zip(slips, below.slides.headings, below.slides.straight, strict=True):
+            slides = dot(known, known) > 0
+            later = where_vector(straight, known, rolling.later_heading(slip, known))
+            found.append(where_vector(slides, later, rolling.NONE))
+        return found[0], found[1]
+
+    def ends_in_groove(
+        self, state: Travel, below: Ground, sides: groove.Sides, spin: Vector3, v: Vector3, course: groove.Course
+    ) -> list[Number]:
+        """`derived` on both sides of a groove: what holds the ball there, and, where friction may stop them, its
+        slips."""
+        size, radius = frozen(total([abs(push) for push in course.pushes])), self.scene.ball.radius
+        holds = [ratio(radius * push, size) for push in course.pushes]
+        if below.slides is None:
+            return holds
+        spare = groove.spare(sides, course, below.slides.limits)
+        slips = groove.slips(radius, sides, v, spin)
+        ends = []
+        for i, limit in enumerate(below.slides.limits):
+            limited = jnp.isfinite(limit) & (limit > 0) & sides.grips[i]
+            holds[i] = where(limited, radius * spare[i], holds[i])
+            known = below.slides.headings[i]
+            ends.append(where(dot(known, known) > 0, dot(known, slips[i]), 1.0))
+        return [*holds, *ends]
+
+    def enter(self, contact: Any, time: Any, state: Travel, on: Any, pull_at: Any) -> Entry:
+        """How a ball goes on that meets a surface with that contact, or where what holds it in a groove ends."""
+        flight, ball, index = state.flight, self.scene.ball, contact.index
+        alone, is_met = second_of(state) < 0, index < self.scene.n_contacts
+        beside = where(alone & is_met, index, second_of(state))
+        joined = state._replace(support=support_of(phase_of(state), beside, time.dtype))
+        sides = self.sides(time, joined, flight.position, flight.velocity)
+        path = groove.way(ball.radius, sides)
+        one, two = groove.slips(
+            ball.radius, sides, self._arrays(flight.velocity, time), self._arrays(flight.spin, time)
+        )
+        held = norm(one) == 0, norm(two) == 0
+        if self.floors.have_friction:
+            unit = self.sides(time, joined, flight.position, path.along)
+            ahead = scale(dot(path.along, flight.velocity), path.along)
+            pull = self._arrays(pull_at(time, flight._replace(velocity=ahead)), time)
+            ends = tuple((index == self.end_of_hold + i) & ~alone & on for i in (0, 1))
+            eps = float(jnp.finfo(time.dtype).eps)
+            least = 100.0 * self.tolerance + 256.0 * eps * (norm(flight.velocity) + ball.radius * norm(flight.spin))
+            change = groove.Change(ends, least, self.first_slip(flight))  # pyright: ignore[reportArgumentType]
+            grip = groove.gripped(ball.radius, ball.inertia_ratio, unit, self._arrays(flight.velocity, time),
+                                  self._arrays(flight.spin, time), pull, self.limits(joined), change)  # fmt: skip
+            return Entry(joined, held, path, grip.course, grip.speed, grip.spin)
+        speed, pivot = groove.entered(ball.radius, ball.inertia_ratio, path, flight.velocity, flight.spin)
+        along = scale(speed, path.along)
+        sides = self.sides(time, joined, flight.position, along)
+        spin = groove.spin_of(path, speed, pivot, flight.spin, sides.grips[0] | sides.grips[1])
+        pull = self._arrays(pull_at(time, flight._replace(velocity=along, spin=spin)), time)
+        course = groove.course(ball.radius, ball.inertia_ratio, sides, along, spin, pull)
+        return Entry(joined, held, path, course, speed, spin)
+
+    def in_groove(self, touch: "Touch", rests: Any) -> tuple[Any, Any, Any]:
+        """Whether a ball on one surface goes on along the groove that another one makes with it; whether one in a
+        groove begins to slip there; and whether a third surface holds it in a corner."""
+        state, index, on, entry = touch.state, touch.contact.index, touch.on, touch.entry
+        assert entry is not None
+        eps = float(jnp.finfo(touch.time.dtype).eps)
+        alone, is_met, course = second_of(state) < 0, index < self.scene.n_contacts, entry.course
+        size = norm(touch.pull) + norm(course.acceleration)
+        pressed = (course.pushes[0] > eps * size) & (course.pushes[1] > eps * size)
+        fits = (state.support >= 0) & is_met & alone & rests & self.floors.include(touch.contact)
+        enters = fits & pressed & self._rolls_freely(entry.joined)
+        over = (index >= self.end_of_hold) & (index < self.end_of_slips) & ~alone & on
+        first = index == self.end_of_hold
+        push = where(first, course.pushes[0], course.pushes[1])
+        limits = self.limits(state)
+        limit = where(first, limits[0], limits[1])
+        limited = jnp.isfinite(limit) & (limit > 0) & where(first, *entry.held)
+        slips = over & limited & (push > eps * size)
+        return enters, slips, on & is_met & ~alone & rests & self._in_corner(touch, entry)
+
+    def _in_corner(self, touch: "Touch", entry: Entry) -> Any:
+        """Whether what is met holds a ball that is in a groove at rest."""
+        time, eps = touch.time, float(jnp.finfo(touch.time.dtype).eps)
+        sides = self.sides(time, entry.joined, touch.state.flight.position, touch.state.flight.velocity)
+        third, (one, two) = self._arrays(touch.normal, time), sides.normals
+        into = scale(-1.0, self.pull(time, touch.state.flight))
+        volume = dot(cross(one, two), third)
+        parts = [ratio(dot(cross(a, b), c), volume)
+                 for a, b, c in ((into, two, third), (one, into, third), (one, two, into))]  # fmt: skip
+        held = (parts[0] >= 0) & (parts[1] >= 0) & (parts[2] >= 0) & (abs(volume) > eps**0.5)
+        return held & (sides.grips[0] | sides.grips[1]) & (self.scene.air is None)
+
+    def _rolls_freely(self, joined: Travel) -> Any:
+        """Whether nothing resists rolling on a side of a groove, which is not followed."""
+        if not self.floors.resist[0]:
+            return True
+        one, two = (self.floors.resistance(self.scene.choice(i), 0) > 0 for i in (phase_of(joined), second_of(joined)))
+        return jnp.logical_not(one | two)
+
+    def beside(self, touch: "Touch", kind: KINDS, after: Flight) -> tuple[Any, Any, Flight]:
+        """Whether a ball stays that comes into a groove, or out of one onto one of its sides, or whose slip changes
+        there; its support; its state. An impact on a third surface takes it off the second one, to which it comes
+        back."""
+        state, index, dtype, entry = touch.state, touch.contact.index, touch.time.dtype, touch.entry
+        assert entry is not None
+        first, second = phase_of(state), second_of(state)
+        enters, left = kind == KINDS.groove, (kind == KINDS.left) & (second >= 0) & (index >= self.end_of_hold)
+        changes = ((kind == KINDS.gripped) | (kind == KINDS.slipped)) & (second >= 0)
+        rests = enters & (second >= 0)  # in a corner
+        along = where_vector(rests, rolling.NONE, scale(entry.speed, entry.path.along))
+        after = after._replace(
+            velocity=where_vector(enters | changes, along, after.velocity),
+            spin=where_vector(enters | changes, where_vector(rests, rolling.NONE, entry.spin), after.spin),
+        )
+        alone = where(left & (index == self.end_of_hold), second, first).astype(dtype)
+        goes_on = (index >= self.scene.n_contacts) & ~left
+        return enters | left | changes, where(enters, entry.joined.support, where(goes_on, state.support, alone)), after
