@@ -337,13 +337,16 @@ def _ending_there(
     system: AbstractSystem, motion: AbstractMotion, arc: Any, found: Any, kept: Any, stays: Any, control: Any
 ) -> tuple[Any, Any]:
     """What ends a contact is found on an interpolant, which is best at both ends of a step: where it is further from
-    them, the step is not kept, and the next one ends just behind it."""
+    them, the step is not kept, and the next one ends just behind it. Not below rounding: where the curvature of a
+    surface jumps, so does what holds the ball there, and every step would end before the jump."""
     if system.n_derived == 0:
         return kept, control
     shortened = motion.shortened(control, (1.0 + 1e-5) * frozen(found.s * arc.unit))
     if shortened is None:
         return kept, control
     inside = (found.s > 1e-3 * arc.length) & (found.s < 0.99 * arc.length)
+    path = norm(frozen(arc.tangent(found.s)[: -system.n_derived])) * arc.length
+    inside = inside & (path > _tiny(arc, found.s))
     early = stays & kept & found.finished & (found.contact >= 0) & inside
     return kept & ~early, keep(early, shortened, control)
 

@@ -285,3 +285,30 @@ def test_no_warning_where_the_curvature_is_given_or_the_program_runs_again():
 def test_exact_refuses_a_gap_that_is_only_sampled():
     with pytest.raises(ValueError, match=r"curvature=\.\.\."):
         simulate(alone(table), FALL, t1=0.3, motion=Exact())
+
+
+# Lying on it, and a curvature that jumps
+
+SIZE = 0.02135
+
+
+def step_down(x, t):
+    """A floor that ends at x = 0, for the centre of a ball: a plane, then a quarter of a cylinder round the edge."""
+    return jnp.sqrt(jnp.maximum(x[0], 0.0) ** 2 + x[2] ** 2) - SIZE
+
+
+def test_a_ball_that_lies_on_it_does_not_fall_through():
+    """With a gap and a rate of exactly zero the bound of its second derivative was raised to zero."""
+    floor = Implicit(lambda x, t: x[2] - SIZE, Rough(0.5))
+    rolls = BallState([0.0, 0.0, SIZE], [0.3, 0.0, 0.0], [0.0, 0.3 / SIZE, 0.0])
+    out = simulate(Scene(Ball(SIZE, 0.0459), {"floor": floor}), rolls, t1=0.4)
+    np.testing.assert_allclose(out.final.position, (0.12, 0.0, SIZE), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("speed", [0.6, 1.0, 3.0])
+def test_a_ball_flies_off_where_the_curvature_jumps(speed):
+    """It is too fast for the edge, which begins all at once. Every step ended before that, until there were no more."""
+    scene = Scene(Ball(SIZE, 0.0459), {"step": Implicit(step_down, Rough(0.0))})
+    rolls = BallState([-0.2, 0.0, SIZE], [speed, 0.0, 0.0], [0.0, speed / SIZE, 0.0])
+    out, late = simulate(scene, rolls, t1=0.2 / speed + 0.05), 0.05
+    np.testing.assert_allclose(out.final.position, (speed * late, 0.0, SIZE - 4.905 * late**2), rtol=0, atol=1e-12)
