@@ -14,8 +14,11 @@ _LABELS = {
     "bounce": "{}",
     "train": "{}, dies out",
     "rolling": "{}, rolling",
-    "left": "over the edge of {}",
+    "left": "off {}",
     "gripped": "{}, slips no more",
+    "slipped": "{}, slips",
+    "stopped": "{}, stops",
+    "groove": "{}, in a groove",
     "passed": "on to {}",
 }
 

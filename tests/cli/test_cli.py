@@ -11,7 +11,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from nonholo_jax import _questions
+from nonholo_jax import KINDS, _questions
+from nonholo_jax._cli.report import _LABELS
 from nonholo_jax.cli import main
 
 BASE = """\
@@ -426,3 +427,7 @@ def test_a_process_of_its_own_draws_and_leaves_standard_output_to_the_answer(tmp
     refused = run("simulate", "none.toml")
     assert (refused.returncode, refused.stdout) == (2, "")
     assert refused.stderr == "nonholo: none.toml: the file must exist, but got no such file; check the path\n"
+
+
+def test_every_kind_of_row_has_a_label():
+    assert set(_LABELS) == set(KINDS._name_to_item) - {"unused"}
