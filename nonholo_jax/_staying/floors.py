@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .._impact import AbstractContactLaw, Contact
+from .._impact import AbstractContactLaw, Contact, rolling
 from .._math import Choice, Number, Vector3, is_constant, ratio, slope
 from .._world import AbstractSurface, Face, Stack
 
@@ -96,14 +96,16 @@ class Floors:
         value, rate = slope(level, x, n)
         return ratio(value, rate)
 
-    def seam(self, contact: Choice, k: int) -> tuple[Vector3, Vector3, Number, Any]:
-        """Pair number k of the planes across which that surface bends otherwise: across, the middle, half the distance
-        between them, and whether there is such a pair."""
+    def seam(self, contact: Choice, k: int) -> tuple[Sequence[Vector3], Vector3, Number, Any]:
+        """Seam number k, across which that surface bends otherwise: the axes across it, its middle, the distance from
+        there, and whether there is such a seam."""
         found = [(i, contact.members[i].surface.seams()) for i in self.indices]
         rows = [(i, seams[k]) for i, seams in found if len(seams) > k]
-        numbers = [i for i, _ in rows]
-        across, middle = (contact.vector([row[part] for _, row in rows], numbers) for part in (0, 1))
-        return across, middle, contact.of([row[2] for _, row in rows], numbers), contact.among(numbers)
+        numbers, most = [i for i, _ in rows], max(len(row[0]) for _, row in rows)
+        each = [(*row[0], *[rolling.NONE] * (most - len(row[0]))) for _, row in rows]
+        axes = [contact.vector(column, numbers) for column in zip(*each, strict=True)]
+        middle = contact.vector([row[1] for _, row in rows], numbers)
+        return axes, middle, contact.of([row[2] for _, row in rows], numbers), contact.among(numbers)
 
     def rolls(self, contact: Choice) -> Any:
         """Whether a ball rolls on that surface, perhaps after sliding."""

@@ -27,7 +27,7 @@ from .._math import (
     where,
     where_vector,
 )
-from .._world import AbstractSurface, Face, Flight, Neighbours, Scene, neighbours, numbers_of
+from .._world import AbstractSurface, Face, Flight, Neighbours, Scene, along, neighbours, numbers_of
 from .floors import Floors, can_settle, is_elastic
 
 _UP = (0.0, 0.0, 1.0)
@@ -319,9 +319,9 @@ class Footing:
             pivot = where(second_of(state) >= 0, dot(free, flight.spin), pivot)
         seams = []
         for k in range(self.floors.n_seams):
-            across, middle, half, present = self.floors.seam(support, k)
-            beyond = abs(dot(across, subtract(flight.position, middle))) > half
-            seams.append((beyond, across, middle, half, on & present))
+            axes, middle, half, present = self.floors.seam(support, k)
+            beyond = norm(along(subtract(flight.position, middle), axes)) > half
+            seams.append((beyond, axes, middle, half, on & present))
         return {"pivot": pivot, "seams": tuple(seams)}
 
     def placed(self, time: Any, support: Any, flight: Flight) -> Flight:

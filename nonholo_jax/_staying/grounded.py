@@ -35,7 +35,7 @@ from .._math import (
     where,
     where_vector,
 )
-from .._world import AbstractSystem, Meeting, Member, Scene, bounces, may_be_flush, round_bend, round_level
+from .._world import AbstractSystem, Meeting, Member, Scene, along, bounces, may_be_flush, round_bend, round_level
 from .floors import Floors
 from .ground import Ground, Travel, code_of, of_code, phase_of, second_of, support_of
 from .settling import Settling
@@ -316,8 +316,8 @@ class Grounded(AbstractSystem):
             unit = 1.0 if contact == settling.end_of_roll else self.scene.ball.radius
             return where(sign != 0, sign * q[k] * unit, 1.0)
         if self.curved:
-            beyond, across, middle, half, present = self._below(time, state).seams[contact - self._n_surfaces]
-            away = round_level((dot(across, subtract(x, middle)),), half, False)
+            beyond, axes, middle, half, present = self._below(time, state).seams[contact - self._n_surfaces]
+            away = round_level(along(subtract(x, middle), axes), half, False)
             return where(present, where(beyond, away, times(-1.0, away)), 1.0)
         across, middle, half, present = self._exit(contact, state, time)
         y = dot(across, subtract(x, middle))
@@ -380,8 +380,8 @@ class Grounded(AbstractSystem):
             low, high = scale(unit, window.track(window.coefficients[k]).bend)
             bend, skip = Interval(where(sign < 0, -high, low), where(sign < 0, -low, high)), sign == 0
         elif self.curved:
-            beyond, across, middle, half, present = self._below(time, state).seams[contact - self._n_surfaces]
-            low, high = round_bend(place, (across,), middle, half, False)
+            beyond, axes, middle, half, present = self._below(time, state).seams[contact - self._n_surfaces]
+            low, high = round_bend(place, tuple(axes), middle, half, False)
             away = (times(-1.0, high), times(-1.0, low))
             bend, skip = Interval(*[where(beyond, a, b) for a, b in zip((low, high), away, strict=True)]), ~present
         else:

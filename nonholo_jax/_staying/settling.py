@@ -27,7 +27,19 @@ from .._math import (
     where,
     where_vector,
 )
-from .._world import Face, Flight, Meeting, Member, Neighbours, Support, magnitude, neighbours, numbers_of, rounding
+from .._world import (
+    Face,
+    Flight,
+    Meeting,
+    Member,
+    Neighbours,
+    Support,
+    along,
+    magnitude,
+    neighbours,
+    numbers_of,
+    rounding,
+)
 from .grooved import Entry, Grooved
 from .ground import Travel, phase_of, second_of
 
@@ -140,8 +152,8 @@ class Settling(Grooved):
                 margin = half - abs(dot(across, subtract(x, face.center)))
                 room = minimum(room, where(touch.edged, margin, jnp.inf))
         for k in range(self.floors.n_seams):
-            across, middle, half, present = self.floors.seam(touch.floor, k)
-            margin = abs(abs(dot(across, subtract(x, middle))) - half)
+            axes, middle, half, present = self.floors.seam(touch.floor, k)
+            margin = abs(norm(along(subtract(x, middle), axes)) - half)
             room = minimum(room, where(present, margin, jnp.inf))
 
         flush = None

@@ -86,8 +86,8 @@ def _box_direction(y: Vector3, half: Vector3, axes: tuple, excess: Vector3 | Non
     return add(add(scale(n[0], axes[0]), scale(n[1], axes[1])), scale(n[2], axes[2]))
 
 
-def along(x: Vector3, axes: tuple) -> Vector3:
-    """The components of a vector."""
+def along(x: Vector3, axes: Sequence) -> Any:
+    """The components of a vector along some axes."""
     return tuple(dot(axis, x) for axis in axes)  # pyright: ignore
 
 
@@ -176,7 +176,7 @@ class AbstractBlock(AbstractSurface):
     def seams(self):
         center, half, axes = self._frame()
         thick = [not (is_constant(h) and h == 0) for h in half]
-        return [(axis, center, h) for axis, h, there in zip(axes, half, thick, strict=True) if there]
+        return [((axis,), center, h) for axis, h, there in zip(axes, half, thick, strict=True) if there]
 
     def directions(self):
         axes = self._frame()[2]

@@ -135,13 +135,13 @@ class AbstractSurface(eqx.Module):
         """The same surface as the event loop sees it, with what is worth computing only once."""
         return self
 
-    def seams(self) -> Sequence[tuple[Vector3, Vector3, Number]]:
-        """Pairs of planes across which the curvature of the surface jumps: the direction across, a point in the middle
-        between the two, and half the distance."""
+    def seams(self) -> Sequence[tuple[Sequence[Vector3], Vector3, Number]]:
+        """Where the curvature of the surface jumps: on pairs of planes (one axis across them, a point in the middle
+        between the two, and half the distance) and on cylinders (two axes, a point on that of the cylinder, radius)."""
         return ()
 
     def direction_within(self, x: Vector3, t: Number, beyond: Sequence[Any]) -> Vector3:
-        """The unit normal of the part of the surface that is, or is not, beyond each pair of `seams`, also where the
+        """The unit normal of the part of the surface that is, or is not, beyond each of the `seams`, also where the
         point is not on that part any more."""
         del beyond
         return self.direction(x, t)
