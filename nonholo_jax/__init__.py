@@ -32,6 +32,7 @@ from ._world import (
     Barrier as Barrier,
     Box as Box,
     Cylinder as Cylinder,
+    Hole as Hole,
     Implicit as Implicit,
     LagrangianSystem as LagrangianSystem,
     Plane as Plane,

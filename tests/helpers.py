@@ -19,6 +19,7 @@ from nonholo_jax import (
     Cylinder,
     Exact,
     Frictional,
+    Hole,
     Implicit,
     Integrated,
     Plane,
@@ -114,8 +115,18 @@ def _shell(center, low, high):
     return lambda rng, n: np.asarray(center) + _directions(rng, n) * rng.uniform(low, high, (n, 1))
 
 
-def _in_frame(center, half, axes):
-    return lambda rng, n: np.asarray(center) + (rng.uniform(-1, 1, (n, 3)) * half) @ np.asarray(axes)
+def _in_frame(center, half, axes, middle=(0.0, 0.0, 0.0)):
+    return lambda rng, n: np.asarray(center) + (rng.uniform(-1, 1, (n, 3)) * half + middle) @ np.asarray(axes)
+
+
+def _ring(center, axes, distance, height):
+    """Points at such a distance from the last of the axes, and at such a height along it."""
+
+    def points(rng, n):
+        across = _directions(rng, n, 2) * rng.uniform(*distance, (n, 1))
+        return np.asarray(center) + np.hstack([across, rng.uniform(*height, (n, 1))]) @ np.asarray(axes)
+
+    return points
 
 
 def _around_axis(point, axis, low, high):
@@ -157,6 +168,8 @@ _GLOBE = {"center": np.array([0.1, 0.2, -0.1]), "radius": 0.5}
 _BOWL = {"center": np.array([0.1, 0.2, -0.1]), "radius": 1.0}
 _POST = {"point": np.array([0.1, 0.2, 0.0]), "axis": np.array([0.2, 1.0, 0.3]), "radius": 0.4}
 _PIPE = {"point": np.array([0.1, 0.2, 0.0]), "axis": np.array([0.2, 1.0, -0.3]), "radius": 0.9}
+_PIT = {"center": np.array([0.1, 0.2, -0.1]), "normal": np.array([0.1, -0.2, 1.0]), "radius": 0.4}
+_PIT_AXES = frame_of(_PIT["normal"], (1.0, 0.0, 0.0))
 
 all_surfaces = (
     SurfaceCase(
@@ -193,6 +206,10 @@ all_surfaces = (
     SurfaceCase(
         "cylinder_inside", lambda **numbers: Cylinder(**numbers, inside=True), _PIPE,
         _around_axis(_PIPE["point"], _PIPE["axis"], 0.0, 0.5), _around_axis(_PIPE["point"], _PIPE["axis"], 1.2, 1.5),
+    ),
+    SurfaceCase(
+        "hole", Hole, _PIT, _in_frame(_PIT["center"], (0.6, 0.6, 0.2), _PIT_AXES, (0.0, 0.0, 0.6)),
+        _ring(_PIT["center"], _PIT_AXES, (0.45, 1.0), (-0.5, -0.2)),
     ),
     SurfaceCase(
         "implicit", _hills, {"amplitude": 0.2, "height": 0.1},

@@ -33,6 +33,7 @@ ROOMS = {
         "surface",
         "box",
         "round",
+        "hole",
         "air",
         "system",
         "touching",

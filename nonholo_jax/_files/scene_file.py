@@ -13,7 +13,7 @@ import numpy as np
 from .._impact import Frictional, Rough, Smooth
 from .._motion import AbstractMotion, Exact, Integrated
 from .._questions import HitTarget, Land, ReturnTo, expand
-from .._world import Air, Ball, BallState, Box, Cylinder, Plane, Rectangle, Scene, Sphere
+from .._world import Air, Ball, BallState, Box, Cylinder, Hole, Plane, Rectangle, Scene, Sphere
 from .montecarlo_file import MonteCarloTask as MonteCarloTask, table_of, task_of
 from .scene_schema import (
     GOALS,
@@ -70,7 +70,8 @@ class SceneFile(NamedTuple):
     monte_carlo: MonteCarloTask | None = None
 
 
-_SHAPE_CLASSES = {"plane": Plane, "rectangle": Rectangle, "box": Box, "sphere": Sphere, "cylinder": Cylinder}
+_SHAPE_CLASSES = {"plane": Plane, "rectangle": Rectangle, "box": Box, "sphere": Sphere, "cylinder": Cylinder,
+                  "hole": Hole}  # fmt: skip
 _LAW_CLASSES = {"rough": Rough, "smooth": Smooth, "frictional": Frictional}
 _GOAL_CLASSES = {"return_to": ReturnTo, "hit_target": HitTarget, "land": Land}
 
@@ -159,11 +160,7 @@ def _built(document: Document, folder: Path) -> SceneFile:
     ball = Ball(**dict(document.ball))
     surfaces = {name: _object(table, _SHAPE_CLASSES) for name, table in document.surfaces.items()}
     for name, surface in surfaces.items():
-        if getattr(surface, "inside", False) and not surface.radius > ball.radius:
-            raise SceneError(
-                f"`surfaces.{name}.radius` must be larger than the ball's radius {ball.radius} where inside = true, "
-                f"but got {surface.radius}; enlarge it or set inside = false"
-            )
+        _check_fits(name, surface, ball.radius)
     air = None if document.air is None else Air(**dict(document.air))
     scene = Scene(ball, surfaces, document.gravity, air)
     _check_outside(scene, document.throw.position)
@@ -171,6 +168,17 @@ def _built(document: Document, folder: Path) -> SceneFile:
     simulate = _simulate(document, scene)
     monte_carlo = None if document.monte_carlo is None else task_of(document.monte_carlo, scene, throw, folder)
     return SceneFile(scene, throw, simulate, _design(document, scene, throw), monte_carlo)
+
+
+def _check_fits(name: str, surface: Any, radius: float) -> None:
+    """A ball must fit into what is hollow."""
+    is_hole = isinstance(surface, Hole)
+    if (is_hole or getattr(surface, "inside", False)) and not surface.radius > radius:
+        where, remedy = (" in a hole", "") if is_hole else (" where inside = true", " or set inside = false")
+        raise SceneError(
+            f"`surfaces.{name}.radius` must be larger than the ball's radius {radius}{where}, "
+            f"but got {surface.radius}; enlarge it{remedy}"
+        )
 
 
 def _object(table: Any, classes: dict[str, Any]) -> Any:

@@ -114,8 +114,16 @@ class CylinderTable(Table):
     inside: bool = False
 
 
+class HoleTable(Table):
+    shape: Literal["hole"]
+    center: Vector3
+    normal: Direction
+    radius: Positive
+    law: LawTable
+
+
 SurfaceTable = Annotated[
-    PlaneTable | RectangleTable | BoxTable | SphereTable | CylinderTable, Field(discriminator="shape")
+    PlaneTable | RectangleTable | BoxTable | SphereTable | CylinderTable | HoleTable, Field(discriminator="shape")
 ]
 
 
@@ -192,7 +200,7 @@ class Document(Table):
 
 
 SURFACES = {"plane": PlaneTable, "rectangle": RectangleTable, "box": BoxTable, "sphere": SphereTable,
-            "cylinder": CylinderTable}  # fmt: skip
+            "cylinder": CylinderTable, "hole": HoleTable}  # fmt: skip
 LAWS = {"rough": RoughTable, "smooth": SmoothTable, "frictional": FrictionalTable}
 GOALS = {"return_to": ReturnToTable, "hit_target": HitTargetTable, "land": LandTable}
 _TABLES = {"ball": BallTable, "air": AirTable, "throw": ThrowTable, "simulate": SimulateTable, "design": DesignTable,

@@ -21,6 +21,7 @@ from .hops import (
 from .polynomial import (
     Interval as Interval,
     Polynomial as Polynomial,
+    Track as Track,
     Window as Window,
     derivative as derivative,
     evaluate as evaluate,

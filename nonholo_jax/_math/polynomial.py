@@ -97,10 +97,10 @@ class Window(NamedTuple):
         """Bernstein bounds of the second derivative, and from them, by the mean value theorem, of the rest."""
         rate = derivative(p)
         bend = bounds(derivative(rate), self.width)
-        rates = self._spread(rate[0], bend)
-        return Track(self._spread(p[0], rates), rates, bend)
+        rates = self.spread(rate[0], bend)
+        return Track(self.spread(p[0], rates), rates, bend)
 
-    def _spread(self, start: Number, slope: Interval) -> Interval:
+    def spread(self, start: Number, slope: Interval) -> Interval:
         """Values over the window of what begins at `start` and changes at a rate in `slope`."""
         if is_constant(self.width) and self.width == 0:
             return Interval(start, start)

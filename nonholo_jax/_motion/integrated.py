@@ -48,7 +48,7 @@ class Integrated(AbstractMotion):
         result is `step_limit`.
     - `edges`: whether a ball that stays on a surface also goes on over the edges and corners of boxes and plates, and
         rests or rolls on elastic surfaces and the outside of round ones; this makes a longer program. `None`: where the
-        scene has the inside of a sphere or a cylinder, or an `Implicit`, that is not elastic.
+        scene has the inside of a sphere or a cylinder, a `Hole` or an `Implicit` that is not elastic.
     - `unroll`: speed only. Whether the stages of a step are written out one after the other, over scalars, which is
         quicker in batches and takes longer to compile; `None` does so in batches of balls.
     - `safe_steps`, `tile`: speed only. How often one turn of the event loop may look ahead for a crossing, and how many

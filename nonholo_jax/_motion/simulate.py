@@ -74,9 +74,9 @@ def simulate(
         to the other; 0 for none.
     - `motion`: `Exact()` or `Integrated(...)`; `None` picks `Exact()` where the scene allows it, else `Integrated()`:
         with air, a gap whose curvature is neither given nor bounded by its program, or friction on a slope, across
-        which a ball slides along a curve. In a scene with the inside of a sphere or a cylinder, or an `Implicit`, it
-        picks `Exact(contact=Integrated())`; so it does, in a second program, where a ball that is not traced stays on
-        something in a way that `Exact()` does not follow.
+        which a ball slides along a curve. In a scene with the inside of a sphere or a cylinder, a `Hole`, or an
+        `Implicit`, it picks `Exact(contact=Integrated())`; so it does, in a second program, where a ball that is not
+        traced stays on something in a way that `Exact()` does not follow.
     - `accuracy`: instead of `motion`, the error of the final position, in m, that is wanted: a Python number > 0. Picks
         `Exact()` where the scene allows it, else solver and tolerances that 99 of 100 throws of
         `experiments/benchmarks/bench_accuracy.py` reach it with; an expectation, no bound. Grazing throws may miss it.

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._world import AbstractSurface, Box, Cylinder, Plane, Rectangle, Scene, Sphere
+from .._world import AbstractSurface, Box, Cylinder, Hole, Plane, Rectangle, Scene, Sphere
 
 MINUS = "\N{MINUS SIGN}"
 
@@ -100,6 +100,13 @@ def _circle(center: np.ndarray, radius: float, inside: bool, cut: bool = True) -
     return Shape(center + radius * out, out if inside else None, cut)
 
 
+def _perpendicular(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors that complete one to an orthonormal frame."""
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    first = first / np.linalg.norm(first)
+    return first, np.cross(axis, first)
+
+
 @singledispatch
 def shapes(surface: AbstractSurface, view: View, middle: np.ndarray, reach: float, radius: float) -> list[Shape]:
     """Any surface: where the ball's centre touches it in the picture plane, moved by a radius against the normal."""
@@ -163,10 +170,9 @@ def _(surface: Cylinder, view: View, middle: np.ndarray, reach: float, radius: f
     axis = axis / np.linalg.norm(axis)
     facing = axis @ view.toward
     if abs(facing) > (1e-6 if view.planar else 0.99):  # an ellipse: slide the circle along the axis into the plane
-        first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-        first = first / np.linalg.norm(first)
+        first, second = _perpendicular(axis)
         angle = np.linspace(0, 2 * np.pi, 361)[:, None]
-        out = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)
+        out = np.cos(angle) * first + np.sin(angle) * second
         rim = point + size * out
         rim = rim - ((rim @ view.toward - view.depth) / facing)[:, None] * axis
         outward = view.flat(out) / np.linalg.norm(view.flat(out), axis=1, keepdims=True)
@@ -179,6 +185,42 @@ def _(surface: Cylinder, view: View, middle: np.ndarray, reach: float, radius: f
     if section == 0 or surface.inside:
         return sides if section > 0 else []
     return [Shape(np.concatenate([sides[0].points, sides[1].points[::-1]]))]
+
+
+@shapes.register
+def _(surface: Hole, view: View, middle: np.ndarray, reach: float, radius: float) -> list[Shape]:
+    center, n, size = as_numpy(surface.center), as_numpy(surface.facing), float(surface.radius)
+    n = n / np.linalg.norm(n)
+    at, up, away = view.flat(center), view.flat(n), float(center @ view.toward) - view.depth
+    if view.planar and abs(np.linalg.norm(up) - 1) > 1e-9:  # a section that is no right angle
+        return shapes.dispatch(AbstractSurface)(surface, view, middle, reach, radius)
+    if view.planar and abs(away) < size:
+        return _section_of_hole(at, up, (size**2 - away**2) ** 0.5, middle, reach)
+    found = shapes(Plane(surface.center, surface.facing, surface.law), view, middle, reach, radius)
+    if view.planar:
+        return found
+    if abs(n @ view.toward) > 0.1:  # the rim is seen
+        first, second = _perpendicular(n)
+        angle = np.linspace(0, 2 * np.pi, 361)[:, None]
+        out = view.flat(np.cos(angle) * first + np.sin(angle) * second)
+        found.append(Shape(at + size * out, out / np.linalg.norm(out, axis=1, keepdims=True)))
+    else:  # what is below the ground is hidden
+        across, deep = np.array([-up[1], up[0]]), (reach + abs(up @ (middle - at))) * up
+        found.append(Shape(np.array([at - size * across, at - size * across - deep, at + size * across - deep,
+                                     at + size * across]), cut=False))  # fmt: skip
+    return found
+
+
+def _section_of_hole(at: np.ndarray, up: np.ndarray, half: float, middle: np.ndarray, reach: float) -> list[Shape]:
+    """The ground to the left and to the right of a hole, and the wall below it."""
+    found, across = [], np.array([-up[1], up[0]])
+    far, deep = (reach + abs(axis @ (middle - at)) for axis in (across, up))
+    ticks = np.linspace(0, 1, 1001)[:, None]
+    for out in (-across, across):
+        ground, wall = at + (half + far * ticks[::-1]) * out, at + half * out - deep * ticks * up
+        inward = np.concatenate([np.broadcast_to(-up, ground.shape), np.broadcast_to(out, wall.shape)])
+        found.append(Shape(np.concatenate([ground, wall]), inward))
+    return found
 
 
 def half_plane(shape: Shape, reach: float) -> np.ndarray:

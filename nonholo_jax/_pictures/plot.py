@@ -100,12 +100,13 @@ def _draw_room(panel: Panel, scene: Scene) -> list[tuple[str, np.ndarray]]:
     for name, shapes in zip(scene.names, room(scene, panel.view, middle, reach), strict=True):
         spots = []
         for shape in shapes:
+            hidden = not (shape.cut or panel.view.planar)  # behind a wall
             edge: dict[str, Any] = {"ec": _INK, "lw": 1.0, "ls": "-" if shape.cut else (0, (4, 3))}
             outline = shape.points if shape.inward is not None else np.vstack([shape.points, shape.points[:1]])
             line, index = _resampled(outline, 5 * point)
             if shape.inward is None:
                 face = "none" if not shape.cut else _SOLID if panel.view.planar else (*to_rgb(_SOLID), 0.6)
-                panel.ax.add_patch(Polygon(outline, fc=face, zorder=1, gid="solid", **edge))
+                panel.ax.add_patch(Polygon(outline, fc=face, zorder=1.6 if hidden else 1, gid="solid", **edge))
                 corner = np.clip(outline, low, high)
                 spots.append((corner.min(axis=0) + corner.max(axis=0))[None] / 2)
                 steps = np.array([(0, -1), (0, 1), (-2, 0), (2, 0)])
@@ -387,7 +388,15 @@ def _caption(scene: Scene, view: View, strikes: Strikes, enlarged: float, fastes
 
 def _title(scene: Scene, trajectory: Any, strikes: Strikes, end: float, title: str | None) -> str:
     if title is None:
-        words = {"left": "off {}", "train": "{} (dying out)", "gripped": "{} (gripped)", "passed": "on to {}"}
+        words = {
+            "left": "off {}",
+            "train": "{} (dying out)",
+            "gripped": "{} (gripped)",
+            "passed": "on to {}",
+            "slipped": "{} (slips)",
+            "stopped": "{} (stops)",
+            "groove": "{} (groove)",
+        }
         names = [words.get(k, "{}").format(scene.names[i]) for i, k in zip(strikes.surface, strikes.kind, strict=True)]
         groups = [(name, len(list(same))) for name, same in groupby(names)]
         words = [f"{name} \N{MULTIPLICATION SIGN}{n}" if n > 1 else name for name, n in groups]

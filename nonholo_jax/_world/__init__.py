@@ -3,6 +3,7 @@
 from .air import Air as Air
 from .ball import Ball as Ball, BallState as BallState, check_ball_state as check_ball_state
 from .box import Box as Box, Rectangle as Rectangle, along as along
+from .hole import Hole as Hole
 from .lagrangian import Barrier as Barrier, LagrangianSystem as LagrangianSystem, as_arrays as as_arrays
 from .round import (
     Cylinder as Cylinder,

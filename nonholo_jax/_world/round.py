@@ -34,7 +34,7 @@ from .._math import (
 from .surface import AbstractSurface, check, nonzero, positive
 
 
-def _perpendicular(axis: Vector3) -> tuple[Vector3, Vector3]:
+def perpendicular(axis: Vector3) -> tuple[Vector3, Vector3]:
     """Two unit vectors that complete a unit vector to an orthonormal frame."""
     x, y, z = axis
     if all(is_constant(c) for c in axis):
@@ -174,7 +174,7 @@ class Cylinder(_AbstractRound):
         check(self)
 
     def _frame(self):
-        return components(self.point), _perpendicular(unit(components(self.axis)))
+        return components(self.point), perpendicular(unit(components(self.axis)))
 
     def is_proper(self, radius):
         return [

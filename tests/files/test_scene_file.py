@@ -17,6 +17,7 @@ from nonholo_jax import (
     Exact,
     Frictional,
     HitTarget,
+    Hole,
     Implicit,
     Integrated,
     Land,
@@ -45,6 +46,7 @@ SURFACES = {
     "sphere": Sphere((0.0, 0.0, 1.0), 1.0, Rough()),
     "sphere from inside": Sphere((5.0, 5.0, 5.0), 3.0, Rough(), inside=True),
     "cylinder": Cylinder((1.0, 0.0, 0.0), (0.0, 1.0, 1.0), 0.1, Rough()),
+    "hole": Hole((1.0, 0.0, 0.0), (0.0, 1.0, 3.0), 0.1, Rough()),
     "cylinder from inside": Cylinder((5.0, 5.0, 0.0), (0.0, 0.0, 1.0), 3.0, Rough(), inside=True),
 }
 GOALS = {
@@ -218,3 +220,15 @@ def test_garwins_throw_is_that_of_the_design_document():
     assert file.simulate == SimulateTask(2.0, 0.0, 16)
     assert file.design.free == ("spin.y",) and file.design.itinerary == ("floor", "table", "floor")
     assert file.design.bounds == {"spin.y": (-400.0, 400.0)}
+
+
+@pytest.mark.parametrize("shape, words", [("hole", "in a hole"), ("cylinder", "where inside = true")])
+def test_a_ball_must_fit_into_what_is_hollow(shape, words, tmp_path):
+    place = "center = [0, 0, 0], normal = [0, 0, 1]" if shape == "hole" else "point = [0, 0, 0], axis = [0, 0, 1]"
+    inside = "" if shape == "hole" else ", inside = true"
+    roof = next(line for line in SHORT.splitlines() if line.startswith("surfaces"))
+    path = tmp_path / "scene.toml"
+    wall = f'surfaces.wall = {{ shape = "{shape}", {place}, radius = 0.9{inside}, law.kind = "rough" }}'
+    path.write_text(SHORT.replace(roof, wall))
+    with pytest.raises(SceneError, match=f"`surfaces.wall.radius` must be larger than .* 1.0 {words}, but got 0.9"):
+        load_scene(path)

@@ -12,6 +12,7 @@ from nonholo_jax import (
     BallState,
     Box,
     Cylinder,
+    Hole,
     Implicit,
     Integrated,
     Plane,
@@ -315,6 +316,8 @@ def test_outlines_lie_where_the_gap_vanishes():
         Sphere((0.1, 0.2, 0.1), 0.6, GRIP, inside=True),
         Cylinder((0.1, 0.2, 0), (0.2, 1, 0.3), 0.3, GRIP),
         Cylinder((0.1, 0.2, 0), (1, 0, 0.3), 0.3, GRIP, inside=True),
+        Hole((0.1, 0.2, 0), (0.2, 0, 1), 0.5, GRIP),
+        Hole((0.1, 0.7, 0), (0.2, 0, 1), 0.5, GRIP),
         wave,
     ]
     for surface in cases:
