@@ -170,7 +170,7 @@ def _built(document: Document, folder: Path) -> SceneFile:
     return SceneFile(scene, throw, simulate, _design(document, scene, throw), monte_carlo)
 
 
-def _check_fits(name: str, surface: Any, radius: float) -> None:
+def _check_fits(name: str, surface: Any, radius: Any) -> None:
     """A ball must fit into what is hollow."""
     is_hole = isinstance(surface, Hole)
     if (is_hole or getattr(surface, "inside", False)) and not surface.radius > radius:

@@ -17,7 +17,7 @@ from .._world import Scene
 from .ensemble_plot import plot_ensemble as plot_ensemble
 from .fit_plot import plot_fits as plot_fits
 from .outline import View, as_numpy, axis_name, half_plane, room, views
-from .samples import Samples, Strikes, end_of, energies, sample
+from .samples import WORDS, Samples, Strikes, end_of, energies, sample
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -388,16 +388,7 @@ def _caption(scene: Scene, view: View, strikes: Strikes, enlarged: float, fastes
 
 def _title(scene: Scene, trajectory: Any, strikes: Strikes, end: float, title: str | None) -> str:
     if title is None:
-        words = {
-            "left": "off {}",
-            "train": "{} (dying out)",
-            "gripped": "{} (gripped)",
-            "passed": "on to {}",
-            "slipped": "{} (slips)",
-            "stopped": "{} (stops)",
-            "groove": "{} (groove)",
-        }
-        names = [words.get(k, "{}").format(scene.names[i]) for i, k in zip(strikes.surface, strikes.kind, strict=True)]
+        names = [WORDS.get(k, "{}").format(scene.names[i]) for i, k in zip(strikes.surface, strikes.kind, strict=True)]
         groups = [(name, len(list(same))) for name, same in groupby(names)]
         words = [f"{name} \N{MULTIPLICATION SIGN}{n}" if n > 1 else name for name, n in groups]
         shown = ", ".join(words[:5]) + (", \N{HORIZONTAL ELLIPSIS}" if len(words) > 5 else "")

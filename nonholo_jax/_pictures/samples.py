@@ -9,6 +9,10 @@ from .._math import kind_name, result_name
 from .._world import Scene
 from .outline import as_numpy
 
+# What a picture's title says of a row of the log, where that is not an ordinary impact.
+WORDS = {"left": "off {}", "train": "{} (dying out)", "gripped": "{} (gripped)", "passed": "on to {}",
+         "slipped": "{} (slips)", "stopped": "{} (stops)", "groove": "{} (groove)"}  # fmt: skip
+
 
 class Samples(NamedTuple):
     """The motion sampled arc by arc; both sides of every impact are in it, so that kinks and jumps are sharp."""
