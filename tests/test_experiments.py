@@ -5,6 +5,7 @@ import pathlib
 
 import numpy as np
 import pytest
+import throws
 from report import Check, table
 
 SCRIPTS = sorted(path.stem for path in (pathlib.Path(__file__).parents[1] / "experiments").glob("*/[0-9]*.py"))
@@ -54,3 +55,23 @@ def test_every_numbered_script_is_tested():
 def test_exit_code_of_a_table(value, above, code, capsys):
     assert table("title", [Check("right", 0.0, 1.0), Check("this", value, 0.5, above)]) == code
     assert ("FAIL" in capsys.readouterr().out) == bool(code)
+
+
+def test_small_version_of_the_study_of_throws():
+    job = throws.Job(0, "corridor", "float64")
+    line = throws.done_one(job, 512)
+    assert line["failed"] == line["lost"] == 0 and max(line["worst"]) < 8.0
+    assert sum(line["results"].values()) == 512 and set(line["results"]) <= {"reached_t1", "max_impacts"}
+    assert line["impacts"] > 3 * 512
+    for name, value in job.ball()._asdict().items():  # a check that can fail: it is told of another ball
+        assert throws.done_one(job, 512, job.ball()._replace(**{name: value * (1.0 + 1e-11)}))["failed"] > 256, name
+
+
+def test_a_study_of_throws_goes_on_where_it_was_cut(tmp_path):
+    lines = throws.Lines(str(tmp_path), 1024)
+    lines.add({"chunk": 0, "failed": 0})
+    with (tmp_path / "chunks.jsonl").open("a") as file:
+        file.write('{"chunk": 1, "fai')
+    assert throws.Lines(str(tmp_path), 1024).chunks == lines.chunks
+    with pytest.raises(ValueError, match="try another --out"):
+        throws.Lines(str(tmp_path), 2048)

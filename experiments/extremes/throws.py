@@ -45,12 +45,12 @@ AHEAD = 2  # chunks that are begun, so that no device waits
 # Chunks
 
 
-def _in_parts(family: Family, dtype: Any, ball: Ball, key: Any, tiles: Any) -> dict:
+def _in_parts(family: Family, dtype: Any, ball: Ball, told: Ball, key: Any, tiles: Any) -> dict:
     """What there is to say of some tiles, one after the other."""
 
     def one(number: Any) -> dict:
-        tile = tile_of(family, ball, jax.random.fold_in(key, number), dtype)
-        codes = jnp.arange(len(NAMES_OF_RESULTS))[:, None] == tile.whole.code[None]
+        tile = tile_of(family, ball, told, jax.random.fold_in(key, number), dtype)
+        codes = jnp.arange(len(NAMES_OF_RESULTS), dtype=jnp.int32)[:, None] == tile.whole.code[None]
         return {
             "impacts": tile.whole.n_impacts.sum(),
             "corners": tile.rows.corner.sum(),
@@ -67,24 +67,27 @@ def _in_parts(family: Family, dtype: Any, ball: Ball, key: Any, tiles: Any) -> d
 
 @functools.cache
 def program(family: str, dtype: str) -> Callable:
-    """A chunk over all devices, compiled once for each size: of the ball, a key, and the numbers of the tiles."""
+    """A chunk over all devices, compiled once for each size: of the arguments of `tile_of`, and the numbers of the
+    tiles."""
     devices = np.array(jax.local_devices())
     parts = functools.partial(_in_parts, FAMILIES[family], np.dtype(dtype))
     specs = {
-        "in_specs": (PartitionSpec(), PartitionSpec(), PartitionSpec("tiles")),
+        "in_specs": (*[PartitionSpec()] * 3, PartitionSpec("tiles")),
         "out_specs": PartitionSpec("tiles"),
     }
     whole = jax.shard_map(parts, mesh=Mesh(devices, ("tiles",)), **specs, check_vma=False)
     return jax.jit(whole, compiler_options={"xla_cpu_prefer_vector_width": 512})
 
 
-def arguments(job: Job) -> tuple[Ball, Any]:
-    return job.ball(), jax.random.fold_in(jax.random.key(VERSION), job.chunk)
+def arguments(job: Job) -> tuple[Ball, Ball, Any]:
+    return job.ball(), job.ball(), jax.random.fold_in(jax.random.key(VERSION), job.chunk)
 
 
-def done_one(job: Job, size: int) -> dict:
+def done_one(job: Job, size: int, told: Ball | None = None) -> dict:
     """The line of one chunk."""
-    found = jax.tree.map(np.asarray, program(job.family, job.dtype)(*arguments(job), np.arange(size // TILE)))
+    ball, same, key = arguments(job)
+    tiles = np.arange(size // TILE)
+    found = jax.tree.map(np.asarray, program(job.family, job.dtype)(ball, told or same, key, tiles))
     results = found["results"].sum(0)
     return {
         "chunk": job.chunk,
@@ -184,9 +187,9 @@ def printed(found: dict, seconds: float, new: int, cpu: float) -> None:
 def replay(job: Job, lane: int) -> int:
     """The log of one throw, and what was found of it."""
     number, at = divmod(lane, TILE)
-    ball, key = arguments(job)
+    ball, told, key = arguments(job)
     one = functools.partial(tile_of, FAMILIES[job.family], dtype=np.dtype(job.dtype))
-    tile = jax.tree.map(lambda x: np.asarray(x)[..., at], jax.jit(one)(ball, jax.random.fold_in(key, number)))
+    tile = jax.tree.map(lambda x: np.asarray(x)[..., at], jax.jit(one)(ball, told, jax.random.fold_in(key, number)))
     print(f"{job}, lane {lane}\n{ball}")
     for k in range(int(tile.rows.live.sum())):
         row = jax.tree.map(lambda x, k=k: x[k], tile.rows)
@@ -216,6 +219,13 @@ def study(throws: int, size: int, lines: Lines) -> tuple[dict, float, int]:
     return found, time.perf_counter() - begun, len(jobs) * size
 
 
+def use_every_core() -> None:
+    """Make every core a device of its own; XLA reads this once, when JAX first computes."""
+    flag = "--xla_force_host_platform_device_count"
+    if flag not in os.environ.get("XLA_FLAGS", ""):
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}={os.cpu_count()}"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--throws", type=float, default=1e8)
@@ -224,6 +234,7 @@ def main() -> int:
     parser.add_argument("--json", metavar="FILE")
     parser.add_argument("--replay", type=int, nargs=2, metavar=("CHUNK", "LANE"))
     options = parser.parse_args()
+    use_every_core()
     unit = TILE * len(jax.devices())
     if options.chunk < unit or options.chunk % unit:
         parser.error(f"--chunk must be a multiple of {unit}, but got {options.chunk}; try {1 << 18}")

@@ -73,6 +73,7 @@ class Doubt(NamedTuple):
 class Found(NamedTuple):
     figures: Any  # in the order of BOUNDS, without the last
     corner: Any
+    open: Any  # rounding decides whether there is one more impact at the end
     doubt: Doubt
 
 
@@ -169,7 +170,10 @@ def judged(solids: Sequence[Solid], ball: Ball, gravity: tuple, arc: Arc, doubt:
     ]
     figures = jnp.maximum(jnp.stack(figures), 0.0) / eps
     next_doubt = grown(doubt, arc, left_with, (round_, ball.radius), dot(end.velocity, facing), size(g))
-    return Found(figures, corner, Doubt(*(jnp.where(corner, NEVER, x) for x in next_doubt)))
+    next_doubt = Doubt(*(jnp.where(corner, NEVER, x) for x in next_doubt))
+    allowed = BOUNDS["end: whole throw off its steps"] * eps
+    just = (arc.struck & (t <= allowed * doubt.late)) | (jnp.abs(touching) <= allowed * next_doubt.place)
+    return Found(figures, corner, ~arc.strikes & just, next_doubt)
 
 
 def flown(solids: Sequence[Solid], radius: Any, g: Any, arc: Arc, left_with: Any, sizes: Sizes) -> list:
@@ -177,7 +181,7 @@ def flown(solids: Sequence[Solid], radius: Any, g: Any, arc: Arc, left_with: Any
     begin, end, t = arc.begin, arc.end, arc.seconds
     off = size(end.place - begin.place - 0.5 * t[None] * (left_with + end.velocity))
     drift = 0.5 * dot(end.velocity, end.velocity) - 0.5 * dot(left_with, left_with) - dot(g, end.place - begin.place)
-    s = (jnp.arange(TIMES) / (TIMES - 1.0))[:, None] * t[None]
+    s = jnp.linspace(0.0, 1.0, TIMES)[:, None] * t[None]
     way = begin.place[:, None] + s[None] * left_with[:, None] + (0.5 * s**2)[None] * g[:, None]
     gaps = functools.reduce(jnp.minimum, [gap_and_normal(solid, way, radius)[0] for solid in solids])
     return [off / sizes.place, jnp.abs(drift) / sizes.square, -jnp.min(gaps, axis=0) / sizes.place]
