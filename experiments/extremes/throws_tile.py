@@ -14,6 +14,7 @@ from nonholo_jax._math.types import NAMES_OF_RESULTS
 jax.config.update("jax_enable_x64", True)
 
 IMPACTS = 8  # of a throw, at most
+AT_ONCE = 64.0  # roundings of the time
 TILE = 256  # throws whose numbers stay in the first caches
 DTYPES = ("float32", "float64")
 G = 9.81
@@ -169,7 +170,7 @@ def tile_of(family: Family, ball: Model, told: Model, key: Any, dtype: Any) -> T
         new, old = (stop.moment, found.doubt), (moment, doubt)
         moment, doubt = jax.tree.map(lambda a, b: jnp.where(live, a, b), new, old)
         # Rounding may put the end of the time before an impact that the last step has come to.
-        unmade = found.open & (stop.n_impacts < impacts)
+        unmade = (left <= AT_ONCE * eps * family.t1) & (stop.code == ENDED) & (stop.n_impacts < impacts)
         fine, figures = fine | unmade, jnp.where((live & ~unmade)[None], found.figures, 0.0)
         row = Row(live, live & ~fine, live & found.corner, live & found.open, each, figures)
         return (moment, left - stop.time, live & fine & goes_on, doubt), row
