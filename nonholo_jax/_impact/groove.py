@@ -217,6 +217,15 @@ def _rubbed(
     return acceleration, spins, pushes, (forces[0], forces[1])
 
 
+def slip_rates(radius: Number, sides: Sides, spin: Vector3, goes: Course) -> tuple[Vector3, Vector3]:
+    """How the slips on both sides change."""
+    rates = []
+    for n, turn in zip(sides.normals, sides.turns, strict=True):
+        turned = add(cross(goes.spins, n), cross(spin, turn))
+        rates.append(along_surface(n, subtract(goes.acceleration, scale(radius, turned))))
+    return rates[0], rates[1]
+
+
 class _Load(NamedTuple):
     """What friction does on the two sides, and could do: forces per mass."""
 

@@ -15,12 +15,13 @@ from .._math import (
     norm,
     ratio,
     scale,
+    subtract,
     total,
     where,
     where_vector,
 )
 from .._world import Flight
-from .ground import Footing, Ground, Travel, phase_of, second_of, support_of
+from .ground import Footing, Ground, Travel, arrays, phase_of, second_of, support_of
 
 if TYPE_CHECKING:
     from .settling import Touch
@@ -55,8 +56,7 @@ class Grooved(Footing):
         spin = groove.spin_of(path, dot(path.along, v), pivot, kept, sides.grips[0] | sides.grips[1])
         if below.slides is not None:
             rub = groove.Rub(below.slides.limits, self._headings(below, groove.slips(ball.radius, sides, v, spin)))  # pyright: ignore
-        pull = self._arrays(self.scene.derivative(time, state.flight._replace(spin=spin), x, v)[1], time)
-        return sides, spin, groove.course(ball.radius, ball.inertia_ratio, sides, v, spin, pull, rub)  # pyright: ignore
+        return sides, spin, self.course(time, state.flight._replace(position=x), sides, v, spin, rub)  # pyright: ignore
 
     def spin_in_groove(self, time: Any, state: Travel, below: Ground, flight: Flight, q: tuple) -> Vector3:
         """The spin of a ball that has come to `flight` at the configuration `q`."""
@@ -68,11 +68,6 @@ class Grooved(Footing):
         if below.slides is not None:
             pivot = dot(path.free, kept)
         return groove.spin_of(path, dot(path.along, flight.velocity), pivot, kept, sides.grips[0] | sides.grips[1])
-
-    @staticmethod
-    def _arrays(a: Vector3, time: Any) -> Vector3:
-        x, y, z = a
-        return jnp.asarray(x, time.dtype), jnp.asarray(y, time.dtype), jnp.asarray(z, time.dtype)
 
     @staticmethod
     def _headings(below: Ground, slips: tuple) -> tuple[Vector3, Vector3]:
@@ -95,13 +90,15 @@ class Grooved(Footing):
         if below.slides is None:
             return holds
         spare = groove.spare(sides, course, below.slides.limits)
-        slips = groove.slips(radius, sides, v, spin)
-        ends = []
+        flight, ends = state.flight, []
+        before = groove.slips(radius, sides, flight.velocity, flight.spin)
+        slips = [subtract(v, scale(radius, cross(spin, n))) for n in sides.normals]
         for i, limit in enumerate(below.slides.limits):
             limited = jnp.isfinite(limit) & (limit > 0) & sides.grips[i]
             holds[i] = where(limited, radius * spare[i], holds[i])
             known = below.slides.headings[i]
-            ends.append(where(dot(known, known) > 0, dot(known, slips[i]), 1.0))
+            least = self.last_slip(flight, before[i])
+            ends.append(where(dot(known, known) > 0, dot(known, slips[i]) - least, 1.0))
         return [*holds, *ends]
 
     def enter(self, contact: Any, time: Any, state: Travel, on: Any, pull_at: Any) -> Entry:
@@ -112,26 +109,24 @@ class Grooved(Footing):
         joined = state._replace(support=support_of(phase_of(state), beside, time.dtype))
         sides = self.sides(time, joined, flight.position, flight.velocity)
         path = groove.way(ball.radius, sides)
-        one, two = groove.slips(
-            ball.radius, sides, self._arrays(flight.velocity, time), self._arrays(flight.spin, time)
-        )
+        one, two = groove.slips(ball.radius, sides, arrays(flight.velocity, time), arrays(flight.spin, time))
         held = norm(one) == 0, norm(two) == 0
         if self.floors.have_friction:
             unit = self.sides(time, joined, flight.position, path.along)
             ahead = scale(dot(path.along, flight.velocity), path.along)
-            pull = self._arrays(pull_at(time, flight._replace(velocity=ahead)), time)
+            pull = arrays(pull_at(time, flight._replace(velocity=ahead)), time)
             ends = tuple((index == self.end_of_hold + i) & ~alone & on for i in (0, 1))
             eps = float(jnp.finfo(time.dtype).eps)
             least = 100.0 * self.tolerance + 256.0 * eps * (norm(flight.velocity) + ball.radius * norm(flight.spin))
             change = groove.Change(ends, least, self.first_slip(flight))  # pyright: ignore[reportArgumentType]
-            grip = groove.gripped(ball.radius, ball.inertia_ratio, unit, self._arrays(flight.velocity, time),
-                                  self._arrays(flight.spin, time), pull, self.limits(joined), change)  # fmt: skip
+            grip = groove.gripped(ball.radius, ball.inertia_ratio, unit, arrays(flight.velocity, time),
+                                  arrays(flight.spin, time), pull, self.limits(joined), change)  # fmt: skip
             return Entry(joined, held, path, grip.course, grip.speed, grip.spin)
         speed, pivot = groove.entered(ball.radius, ball.inertia_ratio, path, flight.velocity, flight.spin)
         along = scale(speed, path.along)
         sides = self.sides(time, joined, flight.position, along)
         spin = groove.spin_of(path, speed, pivot, flight.spin, sides.grips[0] | sides.grips[1])
-        pull = self._arrays(pull_at(time, flight._replace(velocity=along, spin=spin)), time)
+        pull = arrays(pull_at(time, flight._replace(velocity=along, spin=spin)), time)
         course = groove.course(ball.radius, ball.inertia_ratio, sides, along, spin, pull)
         return Entry(joined, held, path, course, speed, spin)
 
@@ -159,7 +154,7 @@ class Grooved(Footing):
         """Whether what is met holds a ball that is in a groove at rest."""
         time, eps = touch.time, float(jnp.finfo(touch.time.dtype).eps)
         sides = self.sides(time, entry.joined, touch.state.flight.position, touch.state.flight.velocity)
-        third, (one, two) = self._arrays(touch.normal, time), sides.normals
+        third, (one, two) = arrays(touch.normal, time), sides.normals
         into = scale(-1.0, self.pull(time, touch.state.flight))
         volume = dot(cross(one, two), third)
         parts = [ratio(dot(cross(a, b), c), volume)

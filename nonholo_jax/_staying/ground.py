@@ -18,6 +18,7 @@ from .._math import (
     components,
     cross,
     dot,
+    minimum,
     norm,
     plus,
     ratio,
@@ -124,6 +125,12 @@ class Forced(NamedTuple):
     push: Number  # what the surface must take away along the normal: negative where it pushes
     along: Vector3  # of gravity and air, along the surface
     twist: Vector3  # `rolling.twist`, of a ball that rolls
+
+
+def arrays(a: Vector3, time: Any) -> Vector3:
+    """The components as arrays of the dtype of the time."""
+    x, y, z = (jnp.asarray(c, time.dtype) for c in a)
+    return x, y, z
 
 
 class Footing:
@@ -271,6 +278,12 @@ class Footing:
         size = norm(flight.velocity) + radius * norm(flight.spin) + root(radius * norm(components(self.scene.gravity)))
         return 4.0 * self.tolerance * (1.0 + size) + max(eps**0.75, 1024.0 * eps) * size
 
+    def last_slip(self, flight: Flight, slip: Vector3) -> Number:
+        """The slip at which one that was `slip` at the beginning of an arc counts as over: before it is so small that
+        the next arc would take it for rounding."""
+        size = norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)
+        return minimum(256.0 * float(jnp.finfo(jnp.result_type(*flight.position)).eps) * size, 0.5 * norm(slip))
+
     def _slides(self, time: Any, state: Travel) -> Slides:
         flight, radius, limits = state.flight, self.scene.ball.radius, self.limits(state)
         sides = self.sides(time, state, flight.position, flight.velocity)
@@ -281,8 +294,26 @@ class Footing:
             slides = (speed > 0) & ~firm & (limit > 0) & (second_of(state) >= 0)
             grips.append(firm | ((speed == 0) & (limit > 0)))
             headings.append(where_vector(slides, scale(ratio(1.0, speed), slip), rolling.NONE))
-            straight.append(speed <= 100.0 * self.tolerance)
+        sides = sides._replace(grips=(grips[0], grips[1]))
+        goes = self.course(
+            time, flight, sides, flight.velocity, flight.spin, groove.Rub(limits, (headings[0], headings[1]))
+        )
+        rates = groove.slip_rates(radius, sides, flight.spin, goes)
+        for slip, known, rate in zip(slips, headings, rates, strict=True):
+            decay, speed = -dot(known, rate), norm(slip)
+            aside = norm(add(rate, scale(decay, known)))
+            most = 100.0 * self.tolerance
+            straight.append((speed <= most) & (decay > 0) & (aside * speed <= most * decay))
         return Slides((grips[0], grips[1]), (headings[0], headings[1]), (straight[0], straight[1]), limits)
+
+    def course(
+        self, time: Any, flight: Flight, sides: groove.Sides, v: Vector3, spin: Vector3, rub: groove.Rub | None
+    ) -> groove.Course:
+        """How a ball in a groove goes on under gravity and air."""
+        ball = self.scene.ball
+        pull = arrays(self.scene.derivative(time, flight._replace(spin=spin), flight.position, v)[1], time)
+        v, spin = arrays(v, time), arrays(spin, time)
+        return groove.course(ball.radius, ball.inertia_ratio, sides, v, spin, pull, rub)
 
     def _brake(
         self, support: Choice, flight: Flight, n: Vector3, push: Number, along: Vector3, rolls: Any
@@ -416,7 +447,12 @@ class Footing:
         most = most * (1.0 + 1.0 / self.scene.ball.inertia_ratio)
         rate = scale(dot(along, heading) - most, heading)
         if not self.parabolic:
-            turning = subtract(along, scale(most, rolling.later_heading(slip, heading)))
+            towards = rolling.later_heading(slip, heading)
+            if self.follows_hold:
+                # A slip that has just begun follows what drives it, faster than an explicit solver can.
+                begins = (dot(along, heading) > most) & (norm(slip) <= self.tolerance**0.5)
+                towards = where_vector(begins, scale(ratio(1.0, norm(along)), along), towards)
+            turning = subtract(along, scale(most, towards))
             rate = where_vector(below.straight, rate, turning)
         return where_vector(slides, rate, rolling.NONE)
 

@@ -306,8 +306,10 @@ class Grounded(AbstractSystem):
                 on = on | found.inside
             return where(on, 1.0, away)
         if contact == self._end_of_slip and self._floors.have_friction:
-            heading = self._below(time, state).heading
-            return where(dot(heading, heading) > 0, dot(heading, q[3:6]), 1.0)
+            below = self._below(time, state)
+            heading, slip = below.heading, dot(below.heading, q[3:6])
+            slip = slip if self.parabolic else slip - self._settling.last_slip(state.flight, below.slip)
+            return where(dot(heading, heading) > 0, slip, 1.0)
         settling = self._settling
         if contact >= settling.end_of_hold:
             return q[contact - settling.end_of_hold - settling.n_derived]

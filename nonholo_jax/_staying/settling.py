@@ -220,7 +220,9 @@ class Settling(Grooved):
             stops = (contact.index >= self.end_of_roll) & (contact.index < self.end_of_hold)
             over = KINDS.where(stops, KINDS.stopped, over)
         if self.follows_hold and self.floors.have_friction:
-            over = KINDS.where(jnp.asarray(lifts) & self._begins_to_slip(touch), KINDS.slipped, over)
+            begins = jnp.asarray(lifts) & self._begins_to_slip(touch)
+            begins = begins & (second_of(touch.state) < 0) if self.have_grooves else begins
+            over = KINDS.where(begins, KINDS.slipped, over)
         kind = KINDS.where(on, KINDS.where(is_exit, over, KINDS.rolling), bounce_or_end)
         enters, cornered = False, False
         if self.have_grooves:
