@@ -52,24 +52,24 @@ def axes_of(turn: Any) -> Any:
 
 
 def top(kind: str, law: Any, frame: tuple, cut: Any) -> dict:
-    """A table top of 4 m by 4 m at the height 0, in the frame (place, axes, quaternion)."""
+    """A table top of 8 m by 8 m at the height 0, in the frame (place, axes, quaternion)."""
     place, axes, turn = frame
     at = lambda *x: place + jnp.stack([jnp.asarray(c, axes.dtype) for c in x]) @ axes  # noqa: E731
-    box = lambda x, half, height=0.5: Box(at(x, 0.0, -height), (half, 2.0, height), law, rotation=turn)  # noqa: E731
+    box = lambda x, half, height=0.5: Box(at(x, 0.0, -height), (half, 4.0, height), law, rotation=turn)  # noqa: E731
     if kind == "plane":
         return {"top": Plane(at(0.0, 0.0, 0.0), axes[2], law)}
     if kind == "rectangle":
-        return {"top": Rectangle(at(0.0, 0.0, 0.0), axes[2], axes[0], (2.0, 2.0), law)}
+        return {"top": Rectangle(at(0.0, 0.0, 0.0), axes[2], axes[0], (4.0, 4.0), law)}
     if kind == "two":
-        return {"a": box(0.5 * (cut - 2.0), 0.5 * (cut + 2.0)), "b": box(0.5 * (cut + 2.0), 0.5 * (2.0 - cut))}
+        return {"a": box(0.5 * (cut - 4.0), 0.5 * (cut + 4.0)), "b": box(0.5 * (cut + 4.0), 0.5 * (4.0 - cut))}
     if kind == "three":
-        edges = (-2.0, cut, cut + 0.3, 2.0)
+        edges = (-4.0, cut, cut + 0.3, 4.0)
         return {
             f"p{i}": box(0.5 * (a + b), 0.5 * (b - a)) for i, (a, b) in enumerate(zip(edges, edges[1:], strict=False))
         }
     if kind == "inlay":
         return {"top": Plane(at(0.0, 0.0, 0.0), axes[2], law), "inlay": box(cut, 0.25, 0.1)}
-    return {"top": box(0.0, 2.0)}
+    return {"top": box(0.0, 4.0)}
 
 
 def walls(law: Any, frame: tuple) -> dict:
