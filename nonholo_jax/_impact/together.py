@@ -231,7 +231,8 @@ def _at_most_elastic(y: Any, change: Any) -> Any:
 
 
 def _pseudo_inverse(rows: Any) -> Any:
-    """The pseudo-inverse, shape (n, k), of few rows of one scale, shape (k, n), row by row (Greville 1960)."""
+    """The pseudo-inverse, shape (n, k), of few rows of one scale, shape (k, n), row by row (Greville 1960). A small row
+    is known in its direction to few digits: what of a larger one is beside it may be rounding, times `known`."""
     tolerance = 1e3 * float(jnp.finfo(rows.dtype).eps)
 
     def one(inverse: Any, each: tuple) -> tuple:
@@ -240,7 +241,7 @@ def _pseudo_inverse(rows: Any) -> Any:
         rest = row - matmul(known, rows)
         rest = rest - matmul(matmul(rest, inverse), rows)
         size = matmul(rest, rest)
-        is_new = size > tolerance * tolerance
+        is_new = size > tolerance * tolerance * (1.0 + matmul(known, known))
         new = rest / jnp.where(is_new, size, 1.0)
         old = matmul(inverse, known) / (1.0 + matmul(known, known))
         column = jnp.where(is_new, new, old)

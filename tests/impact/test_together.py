@@ -223,6 +223,24 @@ def test_turned_copies_agree():
         np.testing.assert_allclose(copy[1], np.asarray(turned) @ turn.T, atol=1e-10)
 
 
+def test_a_row_that_is_nearly_zero_is_not_a_direction_of_its_own():
+    """A ball that rolls straight to a wall keeps of two slips there one. However the wall's two tangents are turned
+    about its normal, also so that one of them has nearly nothing of that slip, the ball stays on its support."""
+    law, v, spin = Rough(0.6, 0.3), jnp.asarray([1.2, -1.0, 0.0]), jnp.asarray([10.0, 12.0, -2.6])
+    run = jax.jit(lambda normals, v, spin: impact([law, law], normals, v, spin, support=0))
+    expected = run(jnp.asarray([(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)]), v, spin)
+    assert float(expected[0][2]) == 0.0
+    for angle in np.concatenate([10.0 ** -np.arange(1.0, 17.0), np.linspace(0.1, 1.5, 8)]):
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.array([(1.0, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)])
+        normals = np.array([(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)]) @ turn.T
+        after = run(jnp.asarray(normals), turn @ v, turn @ spin)
+        assert abs(after[0] @ normals[0]) < 1e-13
+        few = 1e-14 / max(angle, 1e-13)  # a tangent that is turned away from the slip says little of its direction
+        np.testing.assert_allclose(turn.T @ after[0], expected[0], rtol=0, atol=max(1e-13, few))
+        np.testing.assert_allclose(turn.T @ after[1], expected[1], rtol=0, atol=max(1e-13, few) / R)
+
+
 def test_laws_go_over_into_each_other():
     """No friction is a smooth surface, much of it a rough one, whatever the others are, and e_t = -1 keeps the slip."""
     rng = np.random.default_rng(7)
