@@ -88,8 +88,9 @@ def _safe(course: Course, window: Window) -> Interval:
     zero = jnp.maximum(where(free, 1.001 * width, reached), tiny)
     ahead = start + course.pace * zero  # of where that rate alone would bring it; less only by rounding
     first = -2.0 * where(free, ahead, jnp.maximum(ahead, 0.0)) / (zero * zero)
-    rests = (start == 0) & (course.pace == 0)  # a zero already: only its own bend says whether it closes
-    low = jnp.maximum(course.bend.low, where(jnp.isnan(first) | rests, -jnp.inf, first))
+    # At a gap of zero, unless it moves off, nothing but its own bend says whether it closes.
+    known = (free & (course.pace != 0)) | (start > 0)
+    low = jnp.maximum(course.bend.low, where(jnp.isnan(first) | ~known, -jnp.inf, first))
     most = jnp.maximum(jnp.abs(course.bend.low), jnp.abs(course.bend.high))
     return Interval(jnp.clip(low, BLIND, -BLIND), jnp.minimum(most, -BLIND))
 

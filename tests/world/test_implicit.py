@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from nonholo_jax import (
+    RESULTS,
     Ball,
     BallState,
     Barrier,
@@ -196,6 +197,34 @@ def test_bounds_of_the_program_and_of_the_curvature_find_the_same():
     np.testing.assert_array_equal(own.n_impacts, given.n_impacts)
     assert int(jnp.sum(own.n_impacts)) > 100
     np.testing.assert_allclose(own.impacts.time, given.impacts.time, rtol=1e-9)
+
+
+class Tilted(eqx.Module):
+    point: jax.Array
+    normal: jax.Array
+
+    def __call__(self, x, t):
+        return jnp.sum((x - self.point) * self.normal)
+
+
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_a_ball_that_begins_at_a_gap_of_zero_but_for_rounding_does_not_fall_through(speed):
+    """It fell through where the gap was not positive: a value of zero said that the gap could not close."""
+    rng = np.random.default_rng(0)
+    points, normals, v = rng.standard_normal((3, 100, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    v = speed * (v - np.sum(v * normals, axis=1, keepdims=True) * normals)
+
+    @jax.jit
+    @jax.vmap
+    def run(point, normal, v):
+        scene = Scene(Ball(0.05, 1.0), {"it": Implicit(Tilted(point, normal), Rough(0.5))}, gravity=-9.81 * normal)
+        end = simulate(scene, BallState(point, v, jnp.zeros(3)), t1=0.1, motion=Exact(), throw=False)
+        return Tilted(point, normal)(end.final.position, 0.0), end.result == RESULTS.sustained_contact
+
+    gaps, stay = run(*map(jnp.asarray, (points, normals, v)))
+    assert bool(jnp.all(stay))
+    np.testing.assert_allclose(gaps, 0.0, atol=1e-14)
 
 
 @pytest.mark.parametrize("transform", [jax.grad, jax.jacfwd])
