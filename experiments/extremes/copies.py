@@ -292,10 +292,13 @@ def _into(axes: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def states_of(numbers: dict, throws: dict, shift: float, dtype: Any) -> BallState:
-    """The states that throws begin with. What lies on the table is lifted by a shift, not pushed into it."""
+    """The states that throws begin with. What lies on the table is lifted, by roundings alone, not pushed into it."""
     axes, unit, second, hand = (numbers[name] for name in ("axes", "length", "second", "hand"))
     n, low = len(unit), throws["low"]
-    x = throws["x"] + np.c_[np.full((n, 2), shift), np.where(low, abs(shift), shift)]
+    x = (
+        throws["x"]
+        + np.c_[np.full((n, 2), shift), np.where(low, min(abs(shift), 1e3 * float(jnp.finfo(dtype).eps)), shift)]
+    )
     position = numbers["place"] + unit[:, None] * _into(axes, x)
     velocity = (unit / second)[:, None] * _into(axes, throws["v"])
     spin = (hand / second)[:, None] * _into(axes, throws["spin"])  # the mirror image of a spin turns the other way
@@ -360,15 +363,15 @@ def compared(family: Family, law: str, dtype: Any, n: int, seed: int) -> Found:
     shift = max(1e3 * float(jnp.finfo(dtype).eps), 10.0 * max(tolerances), family.shift)
     first, second = (ends(copy, law, dtype, n, seed, 0.0) for copy in (family.one, family.other))
     left_out, by = (first.name == STOPPED) | (second.name == STOPPED), np.full(n, shift)
-    more = drawn(seed, n)["low"]  # what lies on the table, but for rounding, may begin with an impact
+    uncounted = drawn(seed, n)["low"]  # with how many impacts these begin, rounding decides
     for sign in (1.0, -1.0):
         shifted = ends(family.one, law, dtype, n, seed, sign * shift)
-        left_out |= (shifted.name != first.name) | (abs(shifted.impacts - first.impacts) > more)
+        left_out |= (shifted.name != first.name) | ((shifted.impacts != first.impacts) & ~uncounted)
         by = np.maximum(by, apart(first, shifted))
     in_bounds = apart(first, second) / (100.0 * by)
     alike = (first.name == second.name) & (in_bounds <= 1.0)
     if family.other.call != "at" and family.other.parts == 1 and family.other.top == family.one.top:
-        alike &= abs(first.impacts - second.impacts) <= more
+        alike &= (first.impacts == second.impacts) | uncounted
     wrong = ~alike & ~left_out
     names = collections.Counter(NAMES[code] for code in first.name[~left_out] if code > 1)
     return Found(wrong, left_out, float(np.max(in_bounds[alike & ~left_out], initial=0.0)), names)
