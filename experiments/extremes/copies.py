@@ -9,9 +9,9 @@ velocities and spins (times the radius) differ by less than 100 times what such 
 shifted copy ends by another name or with another number of impacts is ill-conditioned: it is left out, and counted; so
 is one that is stopped at `max_impacts`.
 
-What is the same in all: a table top with two walls, on which half of the balls bounce and half lie from the beginning,
-and half of these roll. A fifth of the tables is plastic. For grooves walls may be plastic too, and gravity is tilted.
-The exit code is 1 if two copies disagree.
+What is the same in all: a large table top with two walls, on which half of the balls bounce and half lie from the
+beginning, and half of these roll. A fifth of the tables is plastic. For grooves walls may be plastic too, and gravity
+is tilted. The exit code is 1 if two copies disagree.
 """
 
 import argparse
@@ -294,11 +294,8 @@ def _into(axes: np.ndarray, x: np.ndarray) -> np.ndarray:
 def states_of(numbers: dict, throws: dict, shift: float, dtype: Any) -> BallState:
     """The states that throws begin with. What lies on the table is lifted, by roundings alone, not pushed into it."""
     axes, unit, second, hand = (numbers[name] for name in ("axes", "length", "second", "hand"))
-    n, low = len(unit), throws["low"]
-    x = (
-        throws["x"]
-        + np.c_[np.full((n, 2), shift), np.where(low, min(abs(shift), 1e3 * float(jnp.finfo(dtype).eps)), shift)]
-    )
+    lifted = np.where(throws["low"], min(abs(shift), 1e3 * float(jnp.finfo(dtype).eps)), shift)
+    x = throws["x"] + np.c_[np.full((len(unit), 2), shift), lifted]
     position = numbers["place"] + unit[:, None] * _into(axes, x)
     velocity = (unit / second)[:, None] * _into(axes, throws["v"])
     spin = (hand / second)[:, None] * _into(axes, throws["spin"])  # the mirror image of a spin turns the other way
