@@ -189,7 +189,9 @@ def after_all(scene: Any, time: Any, struck: Any, state: Any, support: Support |
     nearby = _nearby(scene, time, struck, state, support)
     touched, pick = nearby
     v = jnp.stack([jnp.asarray(c, time.dtype) for c in state.velocity])
-    parts, stays = takes_part(frozen(touched), frozen(v))
+    # A ball on its support moves along it. What gravity has added to that by rounding may be more than that of v.
+    across = jnp.sum(jnp.where(touched.is_support[:, None], touched.normals, 0.0), axis=0)
+    parts, stays = takes_part(frozen(touched), frozen(v - jnp.sum(across * v) * across))
     only = jnp.any(parts & (pick(numbers_of(scene)) == struck)) & (jnp.sum(parts, dtype=jnp.int32) == 1)
     touched = touched._replace(takes_part=parts)
 

@@ -163,6 +163,28 @@ def test_turned_copies_of_a_joint(law_name, with_air):
         assert np.max(abs(one[0][:, 2] - R)) < (1e-12 if dtype == jnp.float64 else 1e-5)
 
 
+@laws
+def test_a_slow_ball_stays_on_its_support_when_it_comes_to_a_wall(law):
+    """It was lifted off, where rounding of gravity had given it a velocity across that was no rounding of its own."""
+
+    @jax.jit
+    @jax.vmap
+    def run(turn, place):
+        axes = turned_axes(turn)
+        wall = Plane(place + 0.14 * axes[0], -axes[0], law)
+        scene = Scene(BALL, pieces(law, 1, turn, place) | {"wall": wall}, gravity=jnp.asarray([0.0, 0.0, -9.81]) @ axes)
+        state = rolling(0.02, axes, place, dtype=jnp.float64)
+        t = simulate(scene, state, t1=6.0, motion=Exact(), throw=False, log_size=0)
+        return axes @ (t.final.position - place), axes @ t.final.velocity
+
+    rng = np.random.default_rng(5)
+    turns = rng.normal(size=(100, 4))
+    places, velocities = run(turns / np.linalg.norm(turns, axis=1, keepdims=True), rng.uniform(-2, 2, (100, 3)))
+    np.testing.assert_allclose(velocities[:, 0], velocities[0, 0], rtol=1e-9)
+    np.testing.assert_allclose(places[:, 2], R, rtol=0, atol=1e-9)
+    assert np.all(np.asarray(velocities[:, 0]) < 0)
+
+
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @laws
 def test_landing_beside_a_joint(law, dtype):
