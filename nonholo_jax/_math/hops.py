@@ -113,7 +113,14 @@ class Block(NamedTuple):
             [abs(y) < half + self.radius - 64.0 * self.noise for y, half in zip(self.place, self.half, strict=True)],
         )
         _, leaving, square = self.level(jnp.zeros_like(enters))
-        starts = ~inside | (left_behind & (leaving > 0) & self.is_convex(square))
+        # At an edge, so near to the plane of a face that rounding decides on which side, it may be inside.
+        near = functools.reduce(
+            jnp.logical_and,
+            [abs(y) < half + self.radius + 64.0 * self.noise for y, half in zip(self.place, self.half, strict=True)],
+        )
+        over = self._over()
+        starts = ~inside & ~(near & ~((over[0] & over[1]) | (over[1] & over[2]) | (over[2] & over[0])))
+        starts = starts | (left_behind & (leaving > 0) & self.is_convex(square))
         hits = fits & (slope < 0) & clear
         return where(starts, where(comes, where(hits, h, first), jnp.inf), -1.0), comes & ~hits
 
@@ -140,9 +147,13 @@ class Block(NamedTuple):
         """Whether the level is convex with room to spare, where the ball is so fast near an edge."""
         return square > _CONVEX * self.pulled() * self.radius
 
+    def _over(self) -> list:
+        """Along each axis, whether the centre is between the faces across it."""
+        return [abs(y) <= half for y, half in zip(self.place, self.half, strict=True)]
+
     def _enters(self, left_behind: Any) -> Any:
         """When the centre comes into the greater box."""
-        first = jnp.inf
+        first, over = jnp.inf, self._over()
         for k, (y, w, a, half) in enumerate(zip(*self[:4], strict=True)):
             wide = plus(half, self.radius)
             if is_constant(a) and a == 0:  # it comes from the side that it moves away from
@@ -150,7 +161,7 @@ class Block(NamedTuple):
             else:
                 ways = [(y - wide, w, a), (-y - wide, -w, times(-1.0, a))]
             for gap, rate, pull in ways:
-                touches = abs(gap) <= 64.0 * self.noise
+                touches = (abs(gap) <= 64.0 * self.noise) & over[k - 1] & over[k - 2]
                 rate = where(left_behind & touches, jnp.maximum(rate, 0.0), rate)
                 h = _falls(where(touches, 0.0, gap), rate, pull)
                 (h,) = shared([h])

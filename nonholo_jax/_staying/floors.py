@@ -1,14 +1,18 @@
 """The surfaces of a scene that a ball may stay on."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
+import numpy as np
 
-from .._impact import AbstractContactLaw, Contact, rolling
-from .._math import Choice, Number, Vector3, is_constant, ratio, slope
-from .._world import AbstractSurface, Face, Stack
+from .._impact import AbstractContactLaw, Contact, along_surface, rolling
+from .._math import Choice, Number, Vector3, components, dot, is_constant, norm, ratio, scale, slope
+from .._world import AbstractSurface, Face, Scene, Stack
 
 
 def can_settle(surface: AbstractSurface, curved: bool = False) -> bool:
@@ -138,3 +142,44 @@ def _friction(law: AbstractContactLaw) -> Number:
 
 def _rolls(law: AbstractContactLaw) -> Any:
     return bool(law.rolls) if law.sliding_friction() is None else _friction(law) > 0
+
+
+def stays_curved(scene: Scene, edges: bool | None) -> bool:
+    """Whether a ball is to be followed where it stays on a surface that is not flat; `edges` is that of `Integrated`.
+    From the outside of spheres and cylinders it soon rolls off, so that only those that hold it count here."""
+    if edges is not None:
+        return edges
+    if scene.air is not None and Floors(scene).resist[1]:
+        return True
+    hollow = [each for each in scene.surfaces if type(each).face is AbstractSurface.face and getattr(each, "inside", 1)]
+    return any(can_settle(each, curved=True) and not is_elastic(each) for each in hollow)
+
+
+def slides_across(scene: Scene) -> bool:
+    """Whether a ball is known now, not only when the program runs, to meet a slope that it may slide across."""
+    if any(isinstance(leaf, jax.core.Tracer) or np.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
+        return False
+    # As numbers of Python, on which every operation of JAX would be a program of its own to compile.
+    known = functools.partial(jax.tree.map, lambda x: float(x) if eqx.is_inexact_array(x) and x.ndim == 0 else x)
+    if not any(_may_bend(known(surface.law)) for surface in scene.surfaces):
+        return False
+    scene = known(scene)
+    with jax.ensure_compile_time_eval():  # known numbers, also within a transformation
+        return _meets_slope(scene)
+
+
+def _may_bend(law: AbstractContactLaw) -> bool:
+    """Whether a ball on a slope is slowed against its direction, so that its path there is no parabola."""
+    return law.sliding_friction() is not None or bool(law.resistance()[0] != 0)
+
+
+def _meets_slope(scene: Scene) -> bool:
+    g = components(scene.gravity)
+    above = scale(ratio(-1e6, norm(g)), g)
+    for surface in scene.surfaces:
+        face = surface.face(above, 0.0) if can_settle(surface) else None
+        if face is not None and _may_bend(surface.law):
+            steep = norm(along_surface(face.normal, g)) > 1e-6 * norm(g)
+            if bool(steep) and bool(dot(face.normal, g) < 0):
+                return True
+    return False

@@ -1,15 +1,10 @@
 """What is below a ball that stays on a surface, which way it is driven there, and what resists it."""
 
-import functools
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.core
 import jax.numpy as jnp
-import numpy as np
 
-from .._impact import AbstractContactLaw, along_surface, groove, rolling
+from .._impact import groove, rolling
 from .._math import (
     Choice,
     Number,
@@ -18,7 +13,6 @@ from .._math import (
     components,
     cross,
     dot,
-    minimum,
     norm,
     plus,
     ratio,
@@ -28,8 +22,8 @@ from .._math import (
     where,
     where_vector,
 )
-from .._world import AbstractSurface, Face, Flight, Neighbours, Scene, along, neighbours, numbers_of
-from .floors import Floors, can_settle, is_elastic
+from .._world import Face, Flight, Neighbours, Scene, along, neighbours, numbers_of
+from .floors import Floors
 
 _UP = (0.0, 0.0, 1.0)
 
@@ -274,15 +268,20 @@ class Footing:
     def first_slip(self, flight: Flight) -> Number:
         """The slip with which one begins: so large that it does not end at once where friction hardly fails to hold it,
         as far as that is known to rounding and to the tolerance of a step."""
-        eps, radius = float(jnp.finfo(jnp.result_type(*flight.position)).eps), self.scene.ball.radius
+        eps, radius = self._eps(flight), self.scene.ball.radius
         size = norm(flight.velocity) + radius * norm(flight.spin) + root(radius * norm(components(self.scene.gravity)))
         return 4.0 * self.tolerance * (1.0 + size) + max(eps**0.75, 1024.0 * eps) * size
 
     def last_slip(self, flight: Flight, slip: Vector3) -> Number:
-        """The slip at which one that was `slip` at the beginning of an arc counts as over: before it is so small that
-        the next arc would take it for rounding."""
-        size = norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)
-        return minimum(256.0 * float(jnp.finfo(jnp.result_type(*flight.position)).eps) * size, 0.5 * norm(slip))
+        """The slip at which one that was `slip` at the beginning of an arc counts as over: not so small that a step
+        may end there unseen and the next arc take it for rounding."""
+        eps, size = self._eps(flight), norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)
+        least, speed = self.tolerance * (1.0 + size) + 256.0 * eps * size, norm(slip)
+        return where(speed > least, least, 0.5 * speed)
+
+    @staticmethod
+    def _eps(flight: Flight) -> float:
+        return float(jnp.finfo(jnp.result_type(*flight.position)).eps)
 
     def _slides(self, time: Any, state: Travel) -> Slides:
         flight, radius, limits = state.flight, self.scene.ball.radius, self.limits(state)
@@ -455,44 +454,3 @@ class Footing:
             turning = subtract(along, scale(most, towards))
             rate = where_vector(below.straight, rate, turning)
         return where_vector(slides, rate, rolling.NONE)
-
-
-def stays_curved(scene: Scene, edges: bool | None) -> bool:
-    """Whether a ball is to be followed where it stays on a surface that is not flat; `edges` is that of `Integrated`.
-    From the outside of spheres and cylinders it soon rolls off, so that only those that hold it count here."""
-    if edges is not None:
-        return edges
-    if scene.air is not None and Floors(scene).resist[1]:
-        return True
-    hollow = [each for each in scene.surfaces if type(each).face is AbstractSurface.face and getattr(each, "inside", 1)]
-    return any(can_settle(each, curved=True) and not is_elastic(each) for each in hollow)
-
-
-def slides_across(scene: Scene) -> bool:
-    """Whether a ball is known now, not only when the program runs, to meet a slope that it may slide across."""
-    if any(isinstance(leaf, jax.core.Tracer) or np.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):
-        return False
-    # As numbers of Python, on which every operation of JAX would be a program of its own to compile.
-    known = functools.partial(jax.tree.map, lambda x: float(x) if eqx.is_inexact_array(x) and x.ndim == 0 else x)
-    if not any(_may_bend(known(surface.law)) for surface in scene.surfaces):
-        return False
-    scene = known(scene)
-    with jax.ensure_compile_time_eval():  # known numbers, also within a transformation
-        return _meets_slope(scene)
-
-
-def _may_bend(law: AbstractContactLaw) -> bool:
-    """Whether a ball on a slope is slowed against its direction, so that its path there is no parabola."""
-    return law.sliding_friction() is not None or bool(law.resistance()[0] != 0)
-
-
-def _meets_slope(scene: Scene) -> bool:
-    g = components(scene.gravity)
-    above = scale(ratio(-1e6, norm(g)), g)
-    for surface in scene.surfaces:
-        face = surface.face(above, 0.0) if can_settle(surface) else None
-        if face is not None and _may_bend(surface.law):
-            steep = norm(along_surface(face.normal, g)) > 1e-6 * norm(g)
-            if bool(steep) and bool(dot(face.normal, g) < 0):
-                return True
-    return False

@@ -173,7 +173,7 @@ def thrown(angles, friction, gravity, w, times):
     }
     x, z = jnp.linalg.solve(jnp.stack([one[::2], two[::2]]), jnp.full(2, R, one.dtype))
     state = BallState(jnp.stack([x, 0 * x, z]), jnp.array([0.0, 0.3, 0.0], one.dtype), w)
-    tolerance = 1e-9 if one.dtype == jnp.float64 else 1e-5
+    tolerance = 1e-9 if one.dtype == jnp.float64 else 2e-6
     motion = Exact(contact=Integrated(rtol=tolerance, atol=tolerance))
     out = simulate(Scene(Ball(R, 1.0, ALPHA), planes, gravity=gravity), state, t1=times[-1], motion=motion,
                    max_impacts=64, throw=False)  # fmt: skip
@@ -209,7 +209,7 @@ def test_slipping_in_a_groove(case, dtype):
 ROUND = {  # the coefficients of bowl and post, gravity, the speed, the spin or rolling, what happens
     "spun": ((0.3, 0.2), (0.0, 0.0, -G), 0.6, (5.0, 3.0, -20.0), ["0 grips", "1 grips"]),
     "begins to slip": ((0.015, 0.02), (2.0, 0.0, -G), 0.1, None, ["1 lets go"]),
-    "slips from the start": ((0.9, 0.01), (1.0, 0.5, -G), 0.3, None, ["1 lets go"]),
+    "slips from the start": ((0.9, 0.01), (1.0, 0.5, -G), 0.3, None, ["1 lets go", "1 grips", "1 lets go"]),
 }
 
 

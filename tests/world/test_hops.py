@@ -236,6 +236,39 @@ def test_a_lane_does_not_see_the_others(getkey):
         np.testing.assert_array_equal(a[rest], b[rest])
 
 
+def rounding_below_the_edge(dtype):
+    """Throws that touch an edge, or nearly, so close to the plane of a face that rounding decides on which side."""
+    gaps = [0.0, 1e-6, 1e-5, 3e-5] if dtype == jnp.float32 else [0.0, 1e-14, 1e-13]
+    a, radius = (0.07 if dtype == jnp.float32 else 1e-6), 0.025
+    x = np.array([[-0.5 - (radius + gap) * np.cos(a), 0.0, -0.5 - (radius + gap) * np.sin(a)] for gap in gaps])
+    return BallState(*(jnp.asarray(part, dtype) for part in (x, x * 0.0 + [0.0, 0.0, 3.5], x * 0.0)))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"])
+def test_an_edge_beside_the_plane_of_a_face(dtype):
+    """The ball flies into the edge; it was taken for one that the face next to the edge has behind it."""
+    room = Scene(Ball(0.025, 0.046), {"box": Box(center=(0, 0, 0), half_size=(0.5, 0.5, 0.5), law=Rough())})
+    states = rounding_below_the_edge(dtype)
+    quick, slow = (simulate_batch(room, states, t1=0.1, log_size=size) for size in (0, 4))
+    np.testing.assert_array_equal(quick.n_impacts, slow.n_impacts)
+    if dtype == jnp.float32:
+        assert np.all(np.asarray(quick.n_impacts) == 1)
+    np.testing.assert_allclose(quick.final.velocity, slow.final.velocity, rtol=1e-3 if dtype == jnp.float32 else 1e-6)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64], ids=["float32", "float64"])
+def test_from_an_edge_onto_the_face(dtype):
+    """A ball bounces on an edge, a hair below the top, and lands on the top, not as deep as it began."""
+    radius, drops, t = 0.02, np.array([1.5e-4, 1e-5, 3e-13]), 0.3
+    room = Scene(Ball(radius, 0.046), {"box": Box((0.6, 0.0, 0.715), (0.6, 0.4, 0.015), Rough())})
+    x = -np.sqrt(2 * radius * drops - drops**2) - t
+    position = np.stack([x, 0 * x, 0.75 - drops + 2.0 * t - 0.5 * 9.81 * t * t], axis=1)
+    velocity = 0 * position + [1.0, 0.0, -2.0 + 9.81 * t]
+    states = BallState(*(jnp.asarray(part, dtype) for part in (position, velocity, 0 * position)))
+    end = simulate_batch(room, states, t1=2.0, max_impacts=1, log_size=0).final  # at the second impact
+    np.testing.assert_allclose(end.position[:, 2], 0.75, atol=4 * float(jnp.finfo(dtype).eps))
+
+
 def test_marks_can_be_read_back():
     for mark in [(0, -1, 2), (0, 4, 1), (77, 2, 0), (10**6, 6, 2)]:
         turn, touching, why = (jnp.asarray(x) for x in mark)
