@@ -41,7 +41,7 @@ ROOMS = {
         "scene",
         "lagrangian",
     ],
-    "_staying": ["floors", "ground", "settling", "grounded"],
+    "_staying": ["floors", "ground", "grooved", "settling", "grounded"],
     "_motion": ["crossing", "motion", "integrated", "loop", "hopping", "replay", "accuracy", "trajectory", "simulate"],
     "_questions": [
         "diagnostics",

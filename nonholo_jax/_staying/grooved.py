@@ -1,12 +1,13 @@
 """A ball in the groove between two surfaces: how it goes, what ends there, and how it comes in and out."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .._impact import groove, rolling
+from .._impact import groove, rolling, train
 from .._math import (
     KINDS,
+    Choice,
     Number,
     Vector3,
     cross,
@@ -20,11 +21,8 @@ from .._math import (
     where,
     where_vector,
 )
-from .._world import Flight
+from .._world import Face, Flight
 from .ground import Footing, Ground, Travel, arrays, phase_of, second_of, support_of
-
-if TYPE_CHECKING:
-    from .settling import Touch
 
 
 class Entry(NamedTuple):
@@ -36,6 +34,29 @@ class Entry(NamedTuple):
     course: groove.Course
     speed: Number
     spin: Vector3
+
+
+class Touch(NamedTuple):
+    """A ball that crosses a contact, and what is below it: the face that it is on, or else that of the surface that it
+    hits."""
+
+    contact: Choice
+    time: Any
+    state: Travel
+    normal: Vector3  # of what is hit
+    struck: Flight  # the ball after an ordinary impact
+    pull: Vector3  # gravity, and what air gives then
+    floor: Choice
+    face: Face
+    edged: Any
+    first: train.Start  # of the train that begins
+    law: train.Contact
+    slips: Any  # whether all impacts of the train slip
+    grips: Any  # whether all of them grip
+    on: Any  # whether the ball was on a face before, and is not thrown off it
+    onto: Any  # the surface onto which it passes, or -1; `None` where no faces are flush
+    entry: Entry | None = None  # where there are grooves
+    turn: Vector3 | None = None  # how fast the normal of a curved surface turns as the ball goes along
 
 
 class Grooved(Footing):
@@ -130,7 +151,7 @@ class Grooved(Footing):
         course = groove.course(ball.radius, ball.inertia_ratio, sides, along, spin, pull)
         return Entry(joined, held, path, course, speed, spin)
 
-    def in_groove(self, touch: "Touch", rests: Any) -> tuple[Any, Any, Any]:
+    def in_groove(self, touch: Touch, rests: Any) -> tuple[Any, Any, Any]:
         """Whether a ball on one surface goes on along the groove that another one makes with it; whether one in a
         groove begins to slip there; and whether a third surface holds it in a corner."""
         state, index, on, entry = touch.state, touch.contact.index, touch.on, touch.entry
@@ -150,7 +171,7 @@ class Grooved(Footing):
         slips = over & limited & (push > eps * size)
         return enters, slips, on & is_met & ~alone & rests & self._in_corner(touch, entry)
 
-    def _in_corner(self, touch: "Touch", entry: Entry) -> Any:
+    def _in_corner(self, touch: Touch, entry: Entry) -> Any:
         """Whether what is met holds a ball that is in a groove at rest."""
         time, eps = touch.time, float(jnp.finfo(touch.time.dtype).eps)
         sides = self.sides(time, entry.joined, touch.state.flight.position, touch.state.flight.velocity)
@@ -169,7 +190,7 @@ class Grooved(Footing):
         one, two = (self.floors.resistance(self.scene.choice(i), 0) > 0 for i in (phase_of(joined), second_of(joined)))
         return jnp.logical_not(one | two)
 
-    def beside(self, touch: "Touch", kind: KINDS, after: Flight) -> tuple[Any, Any, Flight]:
+    def beside(self, touch: Touch, kind: KINDS, after: Flight) -> tuple[Any, Any, Flight]:
         """Whether a ball stays that comes into a groove, or out of one onto one of its sides, or whose slip changes
         there; its support; its state. An impact on a third surface takes it off the second one, to which it comes
         back."""

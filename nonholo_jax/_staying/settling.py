@@ -1,7 +1,7 @@
 """Where a ball may stay after its last bounce, and what happens when it crosses a contact there or comes to rest."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +28,6 @@ from .._math import (
     where_vector,
 )
 from .._world import (
-    Face,
     Flight,
     Meeting,
     Member,
@@ -40,31 +39,8 @@ from .._world import (
     numbers_of,
     rounding,
 )
-from .grooved import Entry, Grooved
+from .grooved import Grooved, Touch
 from .ground import Travel, phase_of, second_of
-
-
-class Touch(NamedTuple):
-    """A ball that crosses a contact, and what is below it: the face that it is on, or else that of the surface that it
-    hits."""
-
-    contact: Choice
-    time: Any
-    state: Travel
-    normal: Vector3  # of what is hit
-    struck: Flight  # the ball after an ordinary impact
-    pull: Vector3  # gravity, and what air gives then
-    floor: Choice
-    face: Face
-    edged: Any
-    first: train.Start  # of the train that begins
-    law: train.Contact
-    slips: Any  # whether all impacts of the train slip
-    grips: Any  # whether all of them grip
-    on: Any  # whether the ball was on a face before, and is not thrown off it
-    onto: Any  # the surface onto which it passes, or -1; `None` where no faces are flush
-    entry: Entry | None = None  # where there are grooves
-    turn: Vector3 | None = None  # how fast the normal of a curved surface turns as the ball goes along
 
 
 class Settling(Grooved):
