@@ -243,7 +243,8 @@ def test_along_a_groove(laws, motion):
     out = run(planes, BallState([0, 0, height + 0.01], [0, 0.3, 0], [-3.0, 0, 0]), 1.5, motion, gravity=gravity,
               max_impacts=300)  # fmt: skip
     assert result_of(out) == "reached_t1" and "groove" in kinds(out)
-    assert kinds(out)[-1] == ("gripped" if laws[0] is FRICTION else "groove")  # it comes in with a little slip
+    # With friction it may come in with a little slip, which soon ends.
+    assert kinds(out)[-1] in (("groove", "gripped") if laws[0] is FRICTION else ("groove",))
     row = int(out.n_rows) - 1
     assert {int(out.impacts.support[row]), int(out.impacts.beside[row])} == {0, 1}
     grips = [not isinstance(law, Smooth) for law in laws]
