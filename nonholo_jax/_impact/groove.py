@@ -136,12 +136,8 @@ def _held(
     pull: Vector3,
 ) -> Course:
     """`course` without friction against a slip."""
-    j, (one, two), speed, pivot = (
-        inertia_ratio * radius * radius,
-        sides.normals,
-        dot(path.along, velocity),
-        dot(path.free, spin),
-    )
+    j, (one, two) = inertia_ratio * radius * radius, sides.normals
+    speed, pivot = dot(path.along, velocity), dot(path.free, spin)
     mass = 1.0 + j * dot(path.turning, path.turning)
     drags = speed * dot(path.turning, rates.turning) + pivot * dot(path.turning, rates.free)
     faster = ratio(dot(path.along, pull) - j * drags, mass)

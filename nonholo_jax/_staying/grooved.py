@@ -66,29 +66,26 @@ class Grooved(Footing):
         self, time: Any, state: Travel, below: Ground, q: tuple, v: tuple
     ) -> tuple[groove.Sides, Vector3, groove.Course]:
         """How a ball goes along a groove: its sides, its spin, and what changes them."""
-        ball, x = self.scene.ball, q[:3]
-        sides = self.sides(time, state, x, v)
-        rub, kept, pivot = None, state.flight.spin, self.inner(q)[1]
+        x: Any = q[:3]
+        sides, spin = self.spin_in_groove(time, state, below, x, v, q)  # pyright: ignore[reportArgumentType]
+        rub = None
         if below.slides is not None:
-            sides, kept = sides._replace(grips=below.slides.grips), scale(ratio(1.0, ball.radius), q[3:6])
-        path = groove.way(ball.radius, sides)
-        if below.slides is not None:
-            pivot = dot(path.free, kept)
-        spin = groove.spin_of(path, dot(path.along, v), pivot, kept, sides.grips[0] | sides.grips[1])
-        if below.slides is not None:
-            rub = groove.Rub(below.slides.limits, self._headings(below, groove.slips(ball.radius, sides, v, spin)))  # pyright: ignore
+            slips = groove.slips(self.scene.ball.radius, sides, v, spin)  # pyright: ignore[reportArgumentType]
+            rub = groove.Rub(below.slides.limits, self._headings(below, slips))
         return sides, spin, self.course(time, state.flight._replace(position=x), sides, v, spin, rub)  # pyright: ignore
 
-    def spin_in_groove(self, time: Any, state: Travel, below: Ground, flight: Flight, q: tuple) -> Vector3:
-        """The spin of a ball that has come to `flight` at the configuration `q`."""
+    def spin_in_groove(
+        self, time: Any, state: Travel, below: Ground, x: Vector3, v: Vector3, q: tuple
+    ) -> tuple[groove.Sides, Vector3]:
+        """The sides of the groove that the ball has come along to the place `x`, and its spin there."""
         radius, kept, (_, pivot) = self.scene.ball.radius, state.flight.spin, self.inner(q)
-        sides = self.sides(time, state, flight.position, flight.velocity)
+        sides = self.sides(time, state, x, v)
         if below.slides is not None:
             sides, kept = sides._replace(grips=below.slides.grips), scale(ratio(1.0, radius), q[3:6])
         path = groove.way(radius, sides)
         if below.slides is not None:
             pivot = dot(path.free, kept)
-        return groove.spin_of(path, dot(path.along, flight.velocity), pivot, kept, sides.grips[0] | sides.grips[1])
+        return sides, groove.spin_of(path, dot(path.along, v), pivot, kept, sides.grips[0] | sides.grips[1])
 
     @staticmethod
     def _headings(below: Ground, slips: tuple) -> tuple[Vector3, Vector3]:

@@ -225,7 +225,8 @@ class Grounded(AbstractSystem):
             still = where_vector(below.rolls, scale(pivot, n), free.spin)
             slip = rolling.along_surface(n, slip) if slip else slip
             if settling.have_grooves:
-                inside, in_groove = second_of(state) >= 0, settling.spin_in_groove(time, state, below, flight, q)
+                inside = second_of(state) >= 0
+                _, in_groove = settling.spin_in_groove(time, state, below, flight.position, flight.velocity, q)
         elif below.spinning is not None:
             still = self._spun_down(time, state, below, duration)
         spin = add(still, scale(free.turning, cross(n, subtract(v, slip) if slip else v)))
