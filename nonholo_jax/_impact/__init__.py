@@ -13,5 +13,11 @@ from .projector import (
     whiten as whiten,
 )
 from .rolling import along_surface as along_surface
-from .together import Touched as Touched, reflected as reflected, takes_part as takes_part
+from .together import (
+    Touched as Touched,
+    across_supports as across_supports,
+    reflected as reflected,
+    takes_part as takes_part,
+    without as without,
+)
 from .train import Contact as Contact

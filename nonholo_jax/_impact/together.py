@@ -7,9 +7,11 @@ What. In the coordinates y = (v, sqrt(alpha) r omega), in which the metric is th
 normals of the set and P on all that its contact points may not do. If all have one law, y+ = y - (1 + e_n) P_n y -
 (1 + e_t) (P - P_n) y, which is (4.2) for e_n = e_t. If not, every normal velocity is reversed by its own e_n, and the
 shortest impulse that stops all slips goes to each surface as far as its law goes (`_kicks`). A support is the paper's
-A: all of this happens within its kernel, and it takes what it has to, up to its friction.
+A: all of this happens within its kernel, and it takes what it has to, up to its friction. In a groove both sides are
+supports.
 """
 
+import functools
 import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -24,11 +26,11 @@ from .projector import matmul
 
 
 class Touched(NamedTuple):
-    """Surfaces side by side, with an axis of K in front."""
+    """Surfaces side by side, with an axis of K in front, and S supports."""
 
     normals: Any  # (K, 3)
     takes_part: Any  # whether it is touched, or, for an impact, whether it takes part
-    is_support: Any
+    is_support: Any  # (S, K): which of the surfaces each support is, or none
     restitution: Any
 
 
@@ -70,12 +72,22 @@ def loaded(touched: Touched, velocity: Any) -> tuple[Any, Any]:
 
 
 def takes_part(touched: Touched, velocity: Any) -> tuple[Any, Any]:
-    """Which of the touched surfaces take part in an impact, and whether the support is one of them."""
+    """Which of the touched surfaces take part in an impact, and which of the supports do, shape (S,)."""
     counts, nearest = loaded(touched, velocity)
     eps = float(jnp.finfo(velocity.dtype).eps)
     size = jnp.sqrt(jnp.sum(velocity * velocity))
-    stays = touched.is_support & (abs(matmul(touched.normals, nearest)) <= 64.0 * eps * size)
-    return counts | stays, jnp.any(stays)
+    stays = touched.is_support & (abs(matmul(touched.normals, nearest)) <= 64.0 * eps * size)[None]
+    return counts | jnp.any(stays, axis=0), jnp.any(stays, axis=1)
+
+
+def across_supports(touched: Touched) -> Any:
+    """The normals of the supports, shape (S, 3), zero where there is none."""
+    return jnp.sum(jnp.where(touched.is_support[:, :, None], touched.normals[None], 0.0), axis=1)
+
+
+def without(rows: Any, x: Any) -> Any:
+    """What is left of x beside the rows, which are of unit length or zero."""
+    return x - matmul(matmul(x, rows.T if rows.shape[0] == 1 else _pseudo_inverse(rows)), rows)
 
 
 def reflected(
@@ -83,8 +95,8 @@ def reflected(
     inertia_ratio: Number,
     touched: Touched,
     slip_factors: Callable,
-    friction: Number | None,
-    grips: Any,
+    friction: tuple[Number, ...] | None,
+    grips: tuple[Any, ...],
     velocity: Vector3,
     spin: Vector3,
     levels: tuple[float, ...] | None = None,
@@ -92,32 +104,34 @@ def reflected(
     """Velocity and spin after an impact on all surfaces that take part.
 
     **Arguments:** `slip_factors(closing, slip_squared)` gives the factors s of all laws, as a single impact has them;
-    `friction` is that of the support, or `None` where `grips` says all: it holds the ball (1) or is smooth (0);
+    `friction` is that of each support, or `None` where `grips` says all: it holds the ball (1) or is smooth (0);
     `levels` are the factors of all laws in units of what stops a slip, from the largest to the smallest and without
     zero, if they are known and at least a hundredth apart.
     """
     y, stretch = _whitened(radius, inertia_ratio, velocity, spin)
     share = jnp.asarray(inertia_ratio / (1.0 + inertia_ratio), y.dtype)
     set_ = _Set(*_rows(touched.normals, stretch[3]), touched, slip_factors, share, levels)
-    grips = jnp.asarray(grips).astype(y.dtype)
+    holds = jnp.stack([jnp.asarray(each).astype(y.dtype) for each in grips])
     if friction is None:
-        after = _within(set_, y, grips)[0]
+        after = _within(set_, y, holds)[0]
     else:
-        ends = jax.vmap(lambda grip: _within(set_, y, grip))(jnp.arange(2.0, dtype=y.dtype))
-        (free, gripping), (lighter, heavier), (_, needed) = ends
-        after = free + _held(friction, grips, lighter, heavier, needed * root(share)) * (gripping - free)
+        limits = jnp.stack([jnp.asarray(each, y.dtype) for each in friction])
+        ends = jnp.where(jnp.isinf(limits)[None], holds[None], jnp.arange(2.0, dtype=y.dtype)[:, None])
+        (free, gripping), (lighter, heavier), (_, needed) = jax.vmap(lambda grip: _within(set_, y, grip))(ends)
+        parts = [_held(*each) for each in zip(limits, lighter, heavier, needed * root(share), strict=True)]
+        after = free + functools.reduce(jnp.minimum, parts) * (gripping - free)
     after = after / stretch
     return components(after[:3]), components(after[3:] / radius)  # pyright: ignore[reportReturnType]
 
 
-def _held(friction: Number, grips: Any, lighter: Any, heavier: Any, needed: Any) -> Any:
-    """How far friction goes towards holding a ball on its support: its pressure there goes from `lighter`, without
-    friction, to `heavier`, where it is enough for what is `needed`. All or nothing where friction is infinite."""
+def _held(friction: Any, lighter: Any, heavier: Any, needed: Any) -> Any:
+    """How far friction goes towards holding a ball on a support: its pressure there goes from `lighter`, without
+    friction, to `heavier`, where it is enough for what is `needed`. All the way where friction is infinite."""
     coefficient = jnp.where(jnp.isinf(friction), 0.0, friction)
     slips = needed > coefficient * heavier
     rest = needed - coefficient * (heavier - lighter)
     part = jnp.where(slips, coefficient * lighter / jnp.where(slips, rest, 1.0), 1.0)
-    return jnp.where(jnp.isinf(friction), grips, part)
+    return jnp.where(jnp.isinf(friction), 1.0, part)
 
 
 class _Set(NamedTuple):
@@ -151,14 +165,16 @@ def _rows(normals: Any, weight: Any) -> tuple[Any, Any]:
 
 
 def _within(set_: _Set, y: Any, grip: Any) -> tuple[Any, Any, Any]:
-    """The impact of a ball whose support may not slip (`grip` is 1) or has no friction (0): y afterwards, the impulse
-    that presses the ball on its support, and the one that keeps it from slipping there, in units of y."""
-    touched, others = set_.touched, (set_.touched.takes_part & ~set_.touched.is_support)[:, None]
-    held = (touched.takes_part & touched.is_support)[:, None]
-    n_held = jnp.sum(jnp.where(held, set_.normals, 0.0), axis=0, keepdims=True)
-    t_held = jnp.sum(jnp.where(held[:, :, None], set_.tangents, 0.0), axis=0)
-    fixed = jnp.concatenate([n_held, grip * t_held])  # (3, 6), of unit length or zero
-    free = lambda x: x - matmul(matmul(x, fixed.T), fixed)  # noqa: E731
+    """The impact of a ball that may not slip on a support (`grip`, shape (S,), is 1) or without friction there (0): y
+    afterwards, the impulse that presses the ball on each support, and the one that keeps it from slipping there, in
+    units of y."""
+    touched, others = set_.touched, _others(set_.touched)[:, None]
+    held = touched.takes_part[None] & touched.is_support  # (S, K)
+    n_held = jnp.sum(jnp.where(held[:, :, None], set_.normals[None], 0.0), axis=1)
+    t_held = jnp.sum(jnp.where(held[:, :, None, None], set_.tangents[None], 0.0), axis=1)
+    along = (grip[:, None, None] * t_held).reshape(-1, y.size)  # (2 S, 6), of unit length or zero
+    across, solve = (along, along.T) if len(held) == 1 else _beside(n_held, along)
+    free = lambda x: without(n_held, x - matmul(matmul(x, solve), across))  # noqa: E731
     begin = free(y)
 
     normal = free(jnp.where(others, set_.normals, 0.0))
@@ -175,11 +191,25 @@ def _within(set_: _Set, y: Any, grip: Any) -> tuple[Any, Any, Any]:
     after = begin - scale * push
     slower = _at_most_elastic(after, drag)
     after = after - slower * drag
-    # What others do that the support has to withstand.
+    # What others do that the supports have to withstand.
     own = set_.tangents * (slower * kick)[:, :, None]
     given = jnp.sum(jnp.where(others, -load[:, None] * set_.normals, 0.0), axis=0) + jnp.sum(own, axis=(0, 1))
-    keeps, presses = matmul(t_held, given - y), -matmul(n_held[0], jnp.sum(load[:, None] * set_.normals, axis=0))
-    return after, presses, root(_above_rounding(matmul(keeps, keeps), y))
+    taken = given + after - without(n_held, y)
+    keeps = matmul(taken, solve)
+    presses = matmul(taken - matmul(keeps, along), n_held.T if len(held) == 1 else _pseudo_inverse(n_held))
+    return after, presses, root(_above_rounding(jnp.sum(keeps.reshape(-1, 2) ** 2, axis=1), y))
+
+
+def _beside(normals: Any, rows: Any) -> tuple[Any, Any]:
+    """What of the rows is beside the normals, and its pseudo-inverse: with it two sides share equally what is across
+    their groove."""
+    beside = without(normals, rows)
+    return beside, _pseudo_inverse(beside)
+
+
+def _others(touched: Touched) -> Any:
+    """The surfaces that take part and are no supports."""
+    return touched.takes_part & ~jnp.any(touched.is_support, axis=0)
 
 
 def _kicks(set_: _Set, rows: Any, load: Any, y: Any) -> Any:
@@ -194,7 +224,7 @@ def _kicks(set_: _Set, rows: Any, load: Any, y: Any) -> Any:
         return set_.slip_factors(closing, squared) / set_.share
 
     own = factors(matmul(rows, y))
-    own = jnp.where(set_.touched.takes_part & ~set_.touched.is_support, own, 0.0)
+    own = jnp.where(_others(set_.touched), own, 0.0)
     if set_.levels is None:
         order = jnp.argsort(-lax.stop_gradient(own))
         levels, places = own[order], np.arange(own.size)[:, None]

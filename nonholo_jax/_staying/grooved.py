@@ -13,6 +13,7 @@ from .._math import (
     cross,
     dot,
     frozen,
+    minimum,
     norm,
     ratio,
     scale,
@@ -148,25 +149,28 @@ class Grooved(Footing):
         course = groove.course(ball.radius, ball.inertia_ratio, sides, along, spin, pull)
         return Entry(joined, held, path, course, speed, spin)
 
-    def in_groove(self, touch: Touch, rests: Any) -> tuple[Any, Any, Any]:
-        """Whether a ball on one surface goes on along the groove that another one makes with it; whether one in a
-        groove begins to slip there; and whether a third surface holds it in a corner."""
+    def in_groove(self, touch: Touch, rests: Any) -> tuple[Any, Any, Any, Any]:
+        """Whether a ball on one surface goes on along the groove that another one makes with it; whether it could, but
+        for a push that is nearly zero there, so that it bounces off; whether one in a groove begins to slip there; and
+        whether a third surface holds it in a corner."""
         state, index, on, entry = touch.state, touch.contact.index, touch.on, touch.entry
         assert entry is not None
         eps = float(jnp.finfo(touch.time.dtype).eps)
         alone, is_met, course = second_of(state) < 0, index < self.scene.n_contacts, entry.course
         size = norm(touch.pull) + norm(course.acceleration)
-        pressed = (course.pushes[0] > eps * size) & (course.pushes[1] > eps * size)
+        push = minimum(*course.pushes)
+        pressed, hardly = push > eps * size, (push <= eps * size) & (push > -0.01 * size)
         fits = (state.support >= 0) & is_met & alone & rests & self.floors.include(touch.contact)
-        enters = fits & pressed & self._rolls_freely(entry.joined)
+        follows = fits & self._rolls_freely(entry.joined)
         over = (index >= self.end_of_hold) & (index < self.end_of_slips) & ~alone & on
         first = index == self.end_of_hold
-        push = where(first, course.pushes[0], course.pushes[1])
+        own = where(first, course.pushes[0], course.pushes[1])
         limits = self.limits(state)
         limit = where(first, limits[0], limits[1])
         limited = jnp.isfinite(limit) & (limit > 0) & where(first, *entry.held)
-        slips = over & limited & (push > eps * size)
-        return enters, slips, on & is_met & ~alone & rests & self._in_corner(touch, entry)
+        slips = over & limited & (own > eps * size)
+        cornered = on & is_met & ~alone & rests & self._in_corner(touch, entry)
+        return follows & pressed, follows & hardly, slips, cornered
 
     def _in_corner(self, touch: Touch, entry: Entry) -> Any:
         """Whether what is met holds a ball that is in a groove at rest."""
@@ -189,8 +193,7 @@ class Grooved(Footing):
 
     def beside(self, touch: Touch, kind: KINDS, after: Flight) -> tuple[Any, Any, Flight]:
         """Whether a ball stays that comes into a groove, or out of one onto one of its sides, or whose slip changes
-        there; its support; its state. An impact on a third surface takes it off the second one, to which it comes
-        back."""
+        there; its support; its state."""
         state, index, dtype, entry = touch.state, touch.contact.index, touch.time.dtype, touch.entry
         assert entry is not None
         first, second = phase_of(state), second_of(state)
@@ -202,6 +205,5 @@ class Grooved(Footing):
             velocity=where_vector(enters | changes, along, after.velocity),
             spin=where_vector(enters | changes, where_vector(rests, rolling.NONE, entry.spin), after.spin),
         )
-        alone = where(left & (index == self.end_of_hold), second, first).astype(dtype)
-        goes_on = (index >= self.scene.n_contacts) & ~left
-        return enters | left | changes, where(enters, entry.joined.support, where(goes_on, state.support, alone)), after
+        alone = where(index == self.end_of_hold, second, first).astype(dtype)
+        return enters | left | changes, where(enters, entry.joined.support, where(left, alone, state.support)), after

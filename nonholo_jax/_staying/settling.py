@@ -1,5 +1,7 @@
 """Where a ball may stay after its last bounce, and what happens when it crosses a contact there or comes to rest."""
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -40,7 +42,7 @@ from .._world import (
     rounding,
 )
 from .grooved import Grooved, Touch
-from .ground import Travel, phase_of, second_of
+from .ground import Travel, phase_of, second_of, support_of
 
 
 class Settling(Grooved):
@@ -55,18 +57,37 @@ class Settling(Grooved):
         over = (index >= self.scene.n_contacts) & (index < self.end_of_slip)
         return where((over | jnp.any(is_met)) & jnp.any(reached), best, np.int32(-1))
 
-    def support(self, state: Travel) -> Support:
+    def supports(self, state: Travel) -> tuple[Support, ...]:
         """What the ball stays on, for an impact on something else."""
-        floors, index = self.floors, phase_of(state)
-        floor = self.scene.choice(index)
-        return Support(index, floors.friction(floor) if floors.have_friction else None, floors.rolls(floor))
+        floors, found = self.floors, []
+        for index in (phase_of(state), second_of(state))[: 1 + self.have_grooves]:
+            floor = self.scene.choice(index)
+            rolls = floors.rolls(floor)
+            found.append(Support(index, floors.friction(floor) if floors.have_friction else None, rolls))
+        return tuple(found)
+
+    def _kept(self, contact: Choice, state: Travel, stays: tuple[Any, ...]) -> tuple[Travel, Any]:
+        """The state with the supports that a ball is on after an impact, and whether there are any."""
+        any_, is_hit = functools.reduce(operator.or_, stays), contact.index < self.scene.n_contacts
+        if self.have_grooves:
+            first, second = where(stays[0], phase_of(state), second_of(state)), where(stays[0], second_of(state), -1)
+            kept = support_of(first, where(stays[1], second, -1), jnp.result_type(state.support))
+            state = state._replace(support=where(is_hit & any_ & (second_of(state) >= 0), kept, state.support))
+        return state, (state.support >= 0) & (any_ | ~is_hit)
 
     def touch(
-        self, contact: Choice, time: Any, state: Travel, n: Vector3, struck: Flight, pull: Vector3, stays: Any
+        self,
+        contact: Choice,
+        time: Any,
+        state: Travel,
+        n: Vector3,
+        struck: Flight,
+        pull: Vector3,
+        stays: tuple[Any, ...],
     ) -> Touch:
-        """`stays` says whether a ball that was on a face before an impact is there afterwards."""
-        floors, on = self.floors, (state.support >= 0) & (stays | (contact.index >= self.scene.n_contacts))
-        onto = None
+        """`stays` says on which of its supports a ball still is after an impact."""
+        floors, onto = self.floors, None
+        state, on = self._kept(contact, state, stays)
         if self.joins:  # on a face that is flush with its support it is no less on that
             face, _ = floors.face(self.scene.choice(phase_of(state)), state.flight.position, time)
             onto = self._onto(contact.index, self._flush(time, state, face.normal), time)
@@ -90,9 +111,9 @@ class Settling(Grooved):
             contact, time, state, n, struck, pull, floor, face, edged, first, law, slips, grips, on, onto, entry, turn
         )
 
-    def struck(self, contact: Choice, time: Any, state: Travel) -> tuple[Vector3, Flight, Any]:
+    def struck(self, contact: Choice, time: Any, state: Travel) -> tuple[Vector3, Flight, tuple[Any, ...]]:
         """`Scene.struck`; without an impact at a contact that is no surface."""
-        n, struck, stays = self.scene.struck(contact, time, state.flight, self.support(state))
+        n, struck, stays = self.scene.struck(contact, time, state.flight, self.supports(state))
         if self.follows_hold:
             is_exit, free = contact.index >= self.scene.n_contacts, state.flight
             velocity, spin = (where_vector(is_exit, a, b)
@@ -200,9 +221,9 @@ class Settling(Grooved):
             begins = begins & (second_of(touch.state) < 0) if self.have_grooves else begins
             over = KINDS.where(begins, KINDS.slipped, over)
         kind = KINDS.where(on, KINDS.where(is_exit, over, KINDS.rolling), bounce_or_end)
-        enters, cornered = False, False
+        enters, bounces_off, cornered = False, False, False
         if self.have_grooves:
-            enters, slips_there, cornered = self.in_groove(touch, rests)
+            enters, bounces_off, slips_there, cornered = self.in_groove(touch, rests)
             kind = KINDS.where(slips_there, KINDS.slipped, kind)
             kind = KINDS.where(enters | cornered, KINDS.groove, kind)
         passes = touch.onto >= 0 if self.joins else False
@@ -213,7 +234,7 @@ class Settling(Grooved):
         stuck = ~is_exit & where(on, rests & ~wedged, ends & ~is_floor)
         stuck = stuck & ~passes if self.joins else stuck
         if self.have_grooves:
-            stuck, is_at_rest = stuck & ~enters & ~cornered, is_at_rest | cornered
+            stuck, is_at_rest = stuck & ~enters & ~bounces_off & ~cornered, is_at_rest | cornered
         fault = RESULTS.where(stuck, RESULTS.sustained_contact, RESULTS.reached_t1)
         fault = RESULTS.where(~on & endless, RESULTS.no_limit, fault)
         goes = is_exit & ~grips & ~jnp.asarray(lifts) & ~jnp.asarray(stops)
@@ -368,7 +389,8 @@ class Settling(Grooved):
     def during(self, contact: Choice, time: Any, state: Travel, elapsed: Any) -> Travel:
         """The state so long after the first impact of a train."""
         n, struck, _ = self.scene.struck(contact, time, state.flight)
-        touch = self.touch(contact, time, state._replace(support=-1.0), n, struck, self.pull(time, struck), False)
+        alone = state._replace(support=jnp.full_like(time, -1.0))
+        touch = self.touch(contact, time, alone, n, struck, self.pull(time, struck), (False, False))
         first, law = touch.first, touch.law
         last = train.bounced(first, law, touch.slips, train.bounces_within(first, law.restitution, elapsed))
         velocity = add(last.velocity, scale(last.rise, first.normal))

@@ -53,6 +53,9 @@ class Flight(NamedTuple):
     orientation: Any
 
 
+_NONE = Support(-1, None, False)
+
+
 class Scene(AbstractSystem):
     """A ball and what it can hit.
 
@@ -181,26 +184,26 @@ class Scene(AbstractSystem):
     def restitution(self, contact: Choice) -> Number:
         return contact.of([surface.law.restitution for surface in self.chosen(contact)])
 
-    def struck(self, contact: Choice, time: Any, state: Flight, support: Support | None = None) -> tuple:
-        """The normal of a contact, the state after an impact there, and whether a ball is still on its support then: by
-        Theorem 5.2, for any normal and any law; where it touches several surfaces, on all of them."""
+    def struck(self, contact: Choice, time: Any, state: Flight, supports: tuple[Support, ...] = (_NONE,)) -> tuple:
+        """The normal of a contact, the state after an impact there, and on which of its supports a ball still is then:
+        by Theorem 5.2, for any normal and any law; where it touches several surfaces, on all of them."""
         normals = [surface.direction(state.position, time) for surface in self.chosen(contact)]
         n = shared(contact.vector(normals))
         as_arrays = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, dtype=time.dtype), tree)  # noqa: E731
         single = self._after(contact, n, state.velocity, state.spin)
         if not may_touch_two(self.surfaces, self.ball.radius):
-            return n, state._replace(velocity=single[0], spin=single[1]), False
+            return n, state._replace(velocity=single[0], spin=single[1]), (False,) * len(supports)
         several, no = touches_two(self, time, state.position), jnp.asarray(False)
 
         def on_all(_: Any) -> tuple:
-            unusual, after, stays = after_all(self, time, contact.index, state, support)
-            return unusual, as_arrays(after), stays
+            unusual, after, stays = after_all(self, time, contact.index, state, supports)
+            return unusual, as_arrays(after), tuple(stays)
 
         unusual, after, stays = lax.cond(
-            eqxi.unvmap_any(several), on_all, lambda each: (no, each, no), as_arrays(single)
+            eqxi.unvmap_any(several), on_all, lambda each: (no, each, (no,) * len(supports)), as_arrays(single)
         )
         velocity, spin = jax.tree.map(lambda a, b: where(several & unusual, a, b), after, as_arrays(single))
-        return n, state._replace(velocity=velocity, spin=spin), several & stays
+        return n, state._replace(velocity=velocity, spin=spin), tuple(several & each for each in stays)
 
     def _after(self, contact: Choice, n: Vector3, velocity: Vector3, spin: Vector3, shared: Callable = shared) -> Any:
         """Velocity and spin after an impact on one surface, with the normal there."""

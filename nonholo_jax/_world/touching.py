@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._impact import Rough, Smooth, Touched, reflected, takes_part
+from .._impact import Rough, Smooth, Touched, across_supports, reflected, takes_part, without
 from .._math import Number, Vector3, dot, frozen, is_constant, plus, scale, subtract, times
 from .surface import AbstractSurface
 from .system import magnitude, rounding
@@ -123,9 +123,9 @@ def _is_known(*surfaces: AbstractSurface) -> bool:
 
 
 class Support(NamedTuple):
-    """The surface that a ball stays on."""
+    """A surface that a ball stays on: in a groove one of two."""
 
-    index: Any  # -1 for a ball that flies
+    index: Any  # -1 if there is none
     friction: Number | None  # infinite where the ball never slides or never rolls; `None` if that is so on all surfaces
     rolls: Any
 
@@ -183,15 +183,14 @@ def neighbours(scene: Any, time: Any, normal: Vector3, height: Any, state: Any) 
     return frozen(_every(scene, of))
 
 
-def after_all(scene: Any, time: Any, struck: Any, state: Any, support: Support | None) -> tuple:
+def after_all(scene: Any, time: Any, struck: Any, state: Any, supports: tuple[Support, ...]) -> tuple:
     """An impact on everything that is touched, of a ball that hits the surface number `struck`: whether it is more than
-    an ordinary impact on that; velocity and spin afterwards; and whether the ball is still on its support then."""
-    nearby = _nearby(scene, time, struck, state, support)
+    an ordinary impact on that; velocity and spin afterwards; and on which supports the ball still is then."""
+    nearby = _nearby(scene, time, struck, state, supports)
     touched, pick = nearby
     v = jnp.stack([jnp.asarray(c, time.dtype) for c in state.velocity])
     # A ball on its support moves along it. What gravity has added to that by rounding may be more than that of v.
-    across = jnp.sum(jnp.where(touched.is_support[:, None], touched.normals, 0.0), axis=0)
-    parts, stays = takes_part(frozen(touched), frozen(v - jnp.sum(across * v) * across))
+    parts, stays = takes_part(frozen(touched), frozen(without(across_supports(touched), v)))
     only = jnp.any(parts & (pick(numbers_of(scene)) == struck)) & (jnp.sum(parts, dtype=jnp.int32) == 1)
     touched = touched._replace(takes_part=parts)
 
@@ -205,10 +204,10 @@ def after_all(scene: Any, time: Any, struck: Any, state: Any, support: Support |
 
         return pick(_every(scene, factor))
 
-    friction, rolls = (None, 0.0) if support is None else (support.friction, support.rolls)
-    sizes = scene.ball.radius, scene.ball.inertia_ratio
+    friction = tuple(each.friction for each in supports if each.friction is not None) or None
+    sizes, rolls = (scene.ball.radius, scene.ball.inertia_ratio), tuple(each.rolls for each in supports)
     after = reflected(*sizes, touched, factors, friction, rolls, state.velocity, state.spin, _levels(scene))
-    return ~only | stays, after, stays
+    return ~only | jnp.any(stays), after, stays
 
 
 def numbers_of(scene: Any) -> Any:
@@ -234,13 +233,14 @@ def _spread(x: Any, pick: Callable, count: int) -> Any:
     return jnp.zeros((count,), x.dtype).at[pick(jnp.arange(count, dtype=jnp.int32))].set(x)
 
 
-def _nearby(scene: Any, time: Any, struck: Any, state: Any, support: Support | None) -> tuple[Touched, Callable]:
+def _nearby(scene: Any, time: Any, struck: Any, state: Any, supports: tuple[Support, ...]) -> tuple[Touched, Callable]:
     """The surfaces that are touched, without those that say nothing of their own; and what picks from a value for every
     surface those that are looked at."""
     x, count = state.position, scene.n_contacts
     here = _every(scene, lambda each: _seen(scene, each, time, state))
     numbers = numbers_of(scene)
-    held = jnp.zeros((count,), bool) if support is None else numbers == support.index
+    is_support = jnp.stack([numbers == each.index for each in supports])
+    held = jnp.any(is_support, axis=0)
     touched = (abs(here.gap) <= _TOUCHING * here.noise) | (numbers == struck) | held
     pick: Callable = lambda values: values  # noqa: E731
     if count > _MOST:
@@ -249,10 +249,11 @@ def _nearby(scene: Any, time: Any, struck: Any, state: Any, support: Support | N
         _, few = jax.lax.top_k(frozen(wanted), _MOST)
         pick = lambda values: values[few]  # noqa: E731
         touched, held, here = pick(touched), pick(held), jax.tree.map(pick, here)
+        is_support = jax.vmap(pick)(is_support)
     spare = frozen(_are_spare(scene, time, x, here, touched, held, pick))
     law = lambda each: jnp.asarray(each.surface.law.restitution, time.dtype)  # noqa: E731
     restitution = pick(_every(scene, law))
-    return Touched(here.normal, touched & ~spare, held, restitution), pick
+    return Touched(here.normal, touched & ~spare, is_support, restitution), pick
 
 
 def _seen(scene: Any, each: Member, time: Any, state: Any) -> _Here:

@@ -17,8 +17,9 @@ laws_of_one_kind = pytest.mark.parametrize("law", [Rough(0.6), Rough(0.9, 0.2), 
 
 
 def touched_by(laws, normals, support=None):
-    """Surfaces with those laws, all of which take part."""
-    held = jnp.asarray([i == support for i in range(len(laws))])
+    """Surfaces with those laws, all of which take part; `support` is the number of one, or of the two of a groove."""
+    supports = support if isinstance(support, tuple) else (support,)
+    held = jnp.asarray([[i == each for i in range(len(laws))] for each in supports])
     restitution = jnp.stack([jnp.asarray(law.restitution) for law in laws])
     return Touched(jnp.asarray(normals), jnp.ones(len(laws), bool), held, restitution)
 
@@ -33,6 +34,9 @@ def factors_of(laws):
 def impact(laws, normals, velocity, spin, support=None, friction=None, grips=1.0, counts=None):
     touched = touched_by(laws, normals, support)
     touched = touched if counts is None else touched._replace(takes_part=jnp.asarray(counts))
+    count = len(support) if isinstance(support, tuple) else 1
+    friction = None if friction is None else tuple(jnp.broadcast_to(friction, (count,)))
+    grips = tuple(jnp.broadcast_to(grips, (count,)))
     after = reflected(R, ALPHA, touched, factors_of(laws), friction, grips, tuple(velocity), tuple(spin))
     return jnp.stack(after[0]), jnp.stack(after[1])
 
@@ -122,13 +126,13 @@ def test_which_surfaces_hold_a_rolling_ball():
     for angle, both in ((0.3, False), (0.0, True), (-0.3, True)):
         wall = (-np.cos(angle), 0.0, np.sin(angle))
         parts, stays = takes_part(touched_by([Rough()] * 2, [floor, wall], support=0), v)
-        assert list(np.asarray(parts)) == [both, True] and bool(stays) is both
+        assert list(np.asarray(parts)) == [both, True] and list(np.asarray(stays)) == [both]
     # Down a ramp onto the floor: the floor alone.
     ramp = (np.sin(0.2), 0.0, np.cos(0.2))
     parts, stays = takes_part(
         touched_by([Rough()] * 2, [ramp, floor], support=0), jnp.asarray([np.cos(0.2), 0.0, -np.sin(0.2)])
     )
-    assert list(np.asarray(parts)) == [False, True] and not bool(stays)
+    assert list(np.asarray(parts)) == [False, True] and list(np.asarray(stays)) == [False]
 
 
 @laws_of_one_kind
@@ -263,7 +267,7 @@ def test_levels_that_are_known_are_those_that_are_found():
     rng = np.random.default_rng(9)
     laws = [Rough(0.6), Rough(0.9, 0.2), Smooth(0.7), Rough(0.5, 0.2)]
     touched, (v, spin) = touched_by(laws, random_normals(rng, 4)), state_of(rng)
-    options = (R, ALPHA, touched, factors_of(laws), None, 0.0, tuple(v), tuple(spin))
+    options = (R, ALPHA, touched, factors_of(laws), None, (0.0,), tuple(v), tuple(spin))
     known = reflected(*options, levels=(1.6, 1.2))
     np.testing.assert_allclose(np.concatenate(known), np.concatenate(reflected(*options)), rtol=0, atol=1e-12)
 
@@ -295,6 +299,61 @@ def test_a_cushion_presses_the_ball_on_the_table(friction):
     assert float(turned[1]) * R >= -0.9 - 1e-12
 
 
+def in_groove(rng, count=20):
+    """Normals of two sides and of what a ball meets there that rolls along, held or not by the second side."""
+    for i in range(count):
+        one, two, third = random_normals(rng, 3)
+        along = np.cross(one, two)
+        third = third - max(third @ along + 0.1, 0.0) * along / (along @ along)
+        third = third / np.linalg.norm(third)
+        v, c = along / np.linalg.norm(along), np.linalg.norm(along)
+        spin = (one - two) / (R * c) if i % 2 else np.cross(one, v) / R + 3.0 * one
+        yield np.stack([one, two, third]), v, spin, (1.0, float(i % 2))
+
+
+def test_in_a_groove_both_sides_are_supports():
+    """The paper's law within the kernel of what both sides hold, in whatever order the two are named."""
+    rng, run = np.random.default_rng(20), jax.jit(impact, static_argnums=(0, 4))
+    for normals, v, spin, grips in in_groove(rng):
+        z, laws = np.concatenate([v, spin]), (Rough(0.6),) * 3
+        held = np.vstack([rows_of(n, bool(grip)) for n, grip in zip(normals[:2], grips, strict=True)])
+        np.testing.assert_allclose(held @ z, 0.0, atol=1e-12)
+        free = np.eye(6) - project(held)
+        want = z - 1.6 * project(rows_of(normals[2], True) @ free) @ z
+        got = np.concatenate(run(laws, normals, jnp.asarray(v), jnp.asarray(spin), (0, 1), None, jnp.asarray(grips)))
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-11 * np.max(abs(z)))
+        again = run(laws, normals[[1, 0, 2]], jnp.asarray(v), jnp.asarray(spin), (0, 1), None, jnp.asarray(grips[::-1]))
+        np.testing.assert_allclose(np.concatenate(again), got, rtol=0, atol=1e-11 * np.max(abs(z)))
+
+
+def test_which_sides_of_a_groove_hold_a_ball():
+    """Both beside a wall across; one where what it meets pushes it off the other; none under a slope."""
+    sides, v = [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0)], jnp.asarray([1.0, 0.0, 0.0])
+    c = np.sqrt(0.5)
+    for third, expected in (((-1, 0, 0), [True, True]), ((-c, 0, -c), [True, True]), ((-c, c, 0), [True, False]),
+                            ((-c, 0, c), [False, True]), ((-0.6, 0.64, 0.48), [False, False])):  # fmt: skip
+        parts, stays = takes_part(touched_by([Rough()] * 3, [*sides, third], (0, 1)), v)
+        assert list(np.asarray(stays)) == expected and list(np.asarray(parts)) == [*expected, True]
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.1, 0.3, jnp.inf])
+def test_a_nose_presses_the_ball_into_a_groove(friction):
+    """By hand: the nose gives J (-cos b, -sin b c, -sin b c) with c^2 = 1/2, each side J sin b c against it and at most
+    f J sin b c along the groove, of which rolling needs the same on both."""
+    b, c = 0.7, np.sqrt(0.5)
+    normals = [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-np.cos(b), -c * np.sin(b), -c * np.sin(b))]
+    laws = [Frictional(0.5, 0.0, 1.0)] * 2 + [Smooth(0.9)]
+    v, spin = jnp.asarray([1.0, 0.0, 0.0]), jnp.asarray([0.0, 1.0, -1.0]) / R
+    after, turned = (np.asarray(x) for x in impact(laws, normals, v, spin, (0, 1), friction))
+    np.testing.assert_allclose(after, [-0.9, 0.0, 0.0], atol=1e-13)  # n . v+ = -e n . v
+    np.testing.assert_allclose(turned[[0, 1]], [0.0, -turned[2]], atol=1e-11)
+    # x: -J cos b + 2 F = -1.9; F turns the ball: alpha r d(omega) = -F on each side.
+    force = -ALPHA * R * (turned[1] - 1.0 / R)
+    push = (1.9 + 2.0 * force) / np.cos(b) * c * np.sin(b)
+    limit = friction * push if friction < 1.0 else np.inf
+    assert force == pytest.approx(min(ALPHA * 1.9, limit), abs=1e-12)
+
+
 def test_derivatives():
     """Of everything that is a number, in both modes, against differences."""
     rng = np.random.default_rng(8)
@@ -305,8 +364,8 @@ def test_derivatives():
         n = jnp.asarray(normals[0]) + 0.1 * tilt
         n = n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True))
         restitution = jnp.stack([jnp.asarray(0.5), e, jnp.asarray(0.6)])
-        touched = Touched(n, jnp.ones(3, bool), jnp.asarray([True, False, False]), restitution)
-        after = reflected(R, ALPHA, touched, factors_of(laws), f, 1.0, tuple(v), tuple(spin))
+        touched = Touched(n, jnp.ones(3, bool), jnp.asarray([[True, False, False]]), restitution)
+        after = reflected(R, ALPHA, touched, factors_of(laws), (f,), (1.0,), tuple(v), tuple(spin))
         return jnp.concatenate([jnp.stack(after[0]), R * jnp.stack(after[1])])
 
     at = (jnp.asarray(v[0]), jnp.asarray(spin[0]), jnp.asarray(0.8), jnp.asarray(0.2), jnp.zeros((3, 3)))

@@ -2,11 +2,13 @@
 as one linear system by NumPy, stepped by SciPy, with no code of the library."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
 from nonholo_jax import (
@@ -19,10 +21,14 @@ from nonholo_jax import (
     Frictional,
     Integrated,
     Plane,
+    Rough,
     Scene,
     Sphere,
     simulate,
 )
+from nonholo_jax._impact import groove
+from nonholo_jax._impact.rolling import along_surface
+from nonholo_jax._math import add, components, norm, ratio, scale
 
 R, G, ALPHA, FULL = 0.1, 9.81, 0.4, 1e-8
 RHO, BOWL = 0.4, 0.9  # how far the centre is from the axis of the post, and from the middle of the bowl
@@ -238,3 +244,57 @@ def test_slipping_round_a_post(case):
     assert bool(jnp.any(kinds == KINDS.slipped)) == (case == "begins to slip")
     np.testing.assert_allclose(jnp.linalg.norm(at.velocity, axis=1), abs(rows[:, 1]), atol=2e-6)
     np.testing.assert_allclose(R * at.spin, R * rows[:, 2:], atol=5e-6)
+
+
+@pytest.mark.parametrize("slips", [(False, False), (True, False), (True, True)])
+def test_derivatives_of_the_course_in_a_groove(slips):
+    """In both modes, of all numbers, against differences: held on both sides, on one, on none."""
+    w = jnp.array([3.0, -2.0, 4.0])
+
+    def grip(angles, friction, gravity, turn, speed, spin):
+        a, b = angles
+        normals = ((jnp.cos(a), 0.1 * jnp.sin(a), jnp.sin(a)), (-jnp.cos(b), 0.2 * jnp.sin(a), jnp.sin(b)))
+        one, two = (scale(ratio(1.0, norm(n)), n) for n in normals)
+        turns = tuple(along_surface(n, components(each)) for n, each in zip((one, two), turn, strict=True))
+        sides = groove.Sides((one, two), turns, (jnp.asarray(True), jnp.asarray(True)))
+        path = groove.way(R, sides)
+        velocity = scale(speed, path.along)
+        held = groove.spin_of(path, speed, 0.0, path.along, True)
+        first = add(held, scale(spin[0], two) if slips[0] else (0.0, 0.0, 0.0))  # the other side does not feel it
+        spin = add(first, components(spin) if all(slips) else (0.0, 0.0, 0.0))
+        change = groove.Change((False, False), 1e-9, 1e-8)
+        return groove.gripped(R, ALPHA, sides, velocity, spin, components(gravity), (friction[0], friction[1]), change)
+
+    def goes(*numbers):
+        found = grip(*numbers)
+        course = found.course
+        return jax.tree.map(jnp.asarray, (course.acceleration, scale(R, course.spins), course.pushes, found.speed))
+
+    at = [jnp.asarray(x, float) for x in ((0.6, 0.8), (0.4, 0.5), (0.0, -1.0, -G), np.eye(2, 3), 0.7, w)]
+    assert [bool(held) for held in grip(*at).sides.grips] == [not slides for slides in slips]
+    check_grads(jax.jit(goes), at, 1, atol=1e-5, rtol=1e-5)
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, 0, None))
+def rolled_to_a_wall(points, normals, gravity):
+    """Along the groove of two of three planes, to the third."""
+    planes = {f"{i}": Plane(points[i], normals[i], Rough(0.6, 0.3)) for i in range(3)}
+    state = BallState(jnp.array([0.5, R, R]), jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 1.0, -1.0]) / R)
+    return simulate(Scene(Ball(R, 1.0, ALPHA), planes, gravity=gravity), state, t1=1.2,
+                    motion=Exact(contact=Integrated(rtol=1e-9, atol=1e-9)), throw=False)  # fmt: skip
+
+
+def test_a_wall_across_a_groove_turns_a_ball_back():
+    """Whichever side the ball is said to lie on: both hold it, so that it rolls back along the groove."""
+    orders = np.array(list(itertools.permutations(range(3))))
+    points, normals = np.array([(0, 0, 0), (0, 0, 0), (1.0, 0, 0)]), np.array([(0, 0, 1.0), (0, 1.0, 0), (-1.0, 0, 0)])
+    out = rolled_to_a_wall(jnp.asarray(points[orders]), jnp.asarray(normals[orders]), jnp.array([1.0, -5.0, -5.0]))
+    assert np.all(np.asarray(out.result._value) == RESULTS.reached_t1._value)
+    a, way = 1.0 / (1.0 + 2.0 * ALPHA), 0.5 - R
+    speed = np.sqrt(1.0 + 2.0 * a * way)
+    left = 1.2 - (speed - 1.0) / a
+    x, v = 1.0 - R - 0.6 * speed * left + 0.5 * a * left**2, -0.6 * speed + a * left
+    np.testing.assert_allclose(out.final.position, np.tile([x, R, R], (6, 1)), atol=1e-8)
+    np.testing.assert_allclose(out.final.velocity, np.tile([v, 0, 0], (6, 1)), atol=1e-8)
+    np.testing.assert_allclose(R * out.final.spin, np.tile([0, v, -v], (6, 1)), atol=1e-8)
