@@ -74,6 +74,8 @@ def loaded(touched: Touched, velocity: Any) -> tuple[Any, Any]:
 def takes_part(touched: Touched, velocity: Any) -> tuple[Any, Any]:
     """Which of the touched surfaces take part in an impact, and which of the supports do, shape (S,)."""
     counts, nearest = loaded(touched, velocity)
+    if not len(touched.is_support):
+        return counts, jnp.zeros((0,), bool)
     eps = float(jnp.finfo(velocity.dtype).eps)
     size = jnp.sqrt(jnp.sum(velocity * velocity))
     stays = touched.is_support & (abs(matmul(touched.normals, nearest)) <= 64.0 * eps * size)[None]
@@ -87,6 +89,8 @@ def across_supports(touched: Touched) -> Any:
 
 def without(rows: Any, x: Any) -> Any:
     """What is left of x beside the rows, which are of unit length or zero."""
+    if not len(rows):
+        return x
     return x - matmul(matmul(x, rows.T if rows.shape[0] == 1 else _pseudo_inverse(rows)), rows)
 
 
@@ -111,17 +115,22 @@ def reflected(
     y, stretch = _whitened(radius, inertia_ratio, velocity, spin)
     share = jnp.asarray(inertia_ratio / (1.0 + inertia_ratio), y.dtype)
     set_ = _Set(*_rows(touched.normals, stretch[3]), touched, slip_factors, share, levels)
-    holds = jnp.stack([jnp.asarray(each).astype(y.dtype) for each in grips])
+    holds = _row(grips, y.dtype)
     if friction is None:
-        after = _within(set_, y, holds)[0]
+        after = _within(set_, y, holds, False)[0]
     else:
-        limits = jnp.stack([jnp.asarray(each, y.dtype) for each in friction])
+        limits = _row(friction, y.dtype)
         ends = jnp.where(jnp.isinf(limits)[None], holds[None], jnp.arange(2.0, dtype=y.dtype)[:, None])
-        (free, gripping), (lighter, heavier), (_, needed) = jax.vmap(lambda grip: _within(set_, y, grip))(ends)
+        (free, gripping), (lighter, heavier), (_, needed) = jax.vmap(lambda grip: _within(set_, y, grip, True))(ends)
         parts = [_held(*each) for each in zip(limits, lighter, heavier, needed * root(share), strict=True)]
         after = free + functools.reduce(jnp.minimum, parts) * (gripping - free)
     after = after / stretch
     return components(after[:3]), components(after[3:] / radius)  # pyright: ignore[reportReturnType]
+
+
+def _row(numbers: tuple, dtype: Any) -> Any:
+    array = [jnp.asarray(each).astype(dtype)[None] for each in numbers]
+    return jnp.concatenate(array) if array else jnp.zeros((0,), dtype)
 
 
 def _held(friction: Any, lighter: Any, heavier: Any, needed: Any) -> Any:
@@ -164,47 +173,67 @@ def _rows(normals: Any, weight: Any) -> tuple[Any, Any]:
     return jnp.concatenate([normals, jnp.zeros_like(normals)], axis=-1), rows
 
 
-def _within(set_: _Set, y: Any, grip: Any) -> tuple[Any, Any, Any]:
+def _within(set_: _Set, y: Any, grip: Any, measures: bool) -> tuple[Any, Any, Any]:
     """The impact of a ball that may not slip on a support (`grip`, shape (S,), is 1) or without friction there (0): y
-    afterwards, the impulse that presses the ball on each support, and the one that keeps it from slipping there, in
-    units of y."""
+    afterwards; and, if that is measured, the impulse that presses the ball on each support, and the one that keeps it
+    from slipping there, in units of y."""
     touched, others = set_.touched, _others(set_.touched)[:, None]
-    held = touched.takes_part[None] & touched.is_support  # (S, K)
-    n_held = jnp.sum(jnp.where(held[:, :, None], set_.normals[None], 0.0), axis=1)
-    t_held = jnp.sum(jnp.where(held[:, :, None, None], set_.tangents[None], 0.0), axis=1)
-    along = (grip[:, None, None] * t_held).reshape(-1, y.size)  # (2 S, 6), of unit length or zero
-    across, solve = (along, along.T) if len(held) == 1 else _beside(n_held, along)
-    free = lambda x: without(n_held, x - matmul(matmul(x, solve), across))  # noqa: E731
-    begin = free(y)
+    held = _held_rows(set_, grip)
+    begin = held.free(y)
 
-    normal = free(jnp.where(others, set_.normals, 0.0))
+    normal = held.free(jnp.where(others, set_.normals, 0.0))
     inverse = _pseudo_inverse(normal)
     closing = matmul(normal, begin)
     push = matmul(inverse, (1.0 + touched.restitution) * closing)
     scale = _at_most_elastic(begin, push)
     load = -scale * matmul(inverse.T, push)
 
-    rows = free(jnp.where(others[:, :, None], set_.tangents, 0.0).reshape(-1, 6))
+    rows = held.free(jnp.where(others[:, :, None], set_.tangents, 0.0).reshape(-1, 6))
     rows = (rows - matmul(matmul(rows, inverse), normal)).reshape(-1, 2, 6)
     kick = _kicks(set_, rows, load, begin)
     drag = jnp.sum(rows * kick[:, :, None], axis=(0, 1))
     after = begin - scale * push
     slower = _at_most_elastic(after, drag)
     after = after - slower * drag
+    if not measures:
+        return after, None, None
     # What others do that the supports have to withstand.
     own = set_.tangents * (slower * kick)[:, :, None]
     given = jnp.sum(jnp.where(others, -load[:, None] * set_.normals, 0.0), axis=0) + jnp.sum(own, axis=(0, 1))
-    taken = given + after - without(n_held, y)
-    keeps = matmul(taken, solve)
-    presses = matmul(taken - matmul(keeps, along), n_held.T if len(held) == 1 else _pseudo_inverse(n_held))
+    presses, keeps = held.impulses(given + after - without(held.rows[: len(grip)], y))
     return after, presses, root(_above_rounding(jnp.sum(keeps.reshape(-1, 2) ** 2, axis=1), y))
 
 
-def _beside(normals: Any, rows: Any) -> tuple[Any, Any]:
-    """What of the rows is beside the normals, and its pseudo-inverse: with it two sides share equally what is across
-    their groove."""
-    beside = without(normals, rows)
-    return beside, _pseudo_inverse(beside)
+class _Rows(NamedTuple):
+    """What supports do not let a ball do: S normals, and 2 S rows of the slips with what of them is along the normals.
+    All are of unit length, smaller or zero."""
+
+    rows: Any  # (3 S, 6): the normals, and what of the slips is beside them
+    inverse: Any  # the pseudo-inverse: with it two sides share equally what is across their groove
+    along: Any  # (2 S, 6), of the slips
+
+    def free(self, x: Any) -> Any:
+        return x - matmul(matmul(x, self.inverse), self.rows) if len(self.rows) else x
+
+    def impulses(self, x: Any) -> tuple[Any, Any]:
+        """What they take of x: across each support, and along it."""
+        count = len(self.rows) // 3
+        keeps = matmul(x, self.inverse[:, count:])
+        return matmul(x - matmul(keeps, self.along), self.inverse[:, :count]), keeps
+
+
+def _held_rows(set_: _Set, grip: Any) -> _Rows:
+    held = set_.touched.takes_part[None] & set_.touched.is_support  # (S, K)
+    normals = jnp.sum(jnp.where(held[:, :, None], set_.normals[None], 0.0), axis=1)
+    tangents = jnp.sum(jnp.where(held[:, :, None, None], set_.tangents[None], 0.0), axis=1)
+    along = (grip[:, None, None] * tangents).reshape(-1, set_.normals.shape[1])
+    if len(held) < 2:
+        rows = jnp.concatenate([normals, along])
+        return _Rows(rows, rows.T, along)
+    across = _pseudo_inverse(normals)
+    beside = along - matmul(matmul(along, across), normals)
+    inverse = jnp.concatenate([across, _pseudo_inverse(beside)], axis=1)
+    return _Rows(jnp.concatenate([normals, beside]), inverse, along)
 
 
 def _others(touched: Touched) -> Any:

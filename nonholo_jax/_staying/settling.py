@@ -60,20 +60,21 @@ class Settling(Grooved):
     def supports(self, state: Travel) -> tuple[Support, ...]:
         """What the ball stays on, for an impact on something else."""
         floors, found = self.floors, []
-        for index in (phase_of(state), second_of(state))[: 1 + self.have_grooves]:
+        for which in (phase_of, second_of)[: 1 + self.have_grooves]:
+            index = which(state)
             floor = self.scene.choice(index)
             rolls = floors.rolls(floor)
             found.append(Support(index, floors.friction(floor) if floors.have_friction else None, rolls))
         return tuple(found)
 
-    def _kept(self, contact: Choice, state: Travel, stays: tuple[Any, ...]) -> tuple[Travel, Any]:
+    def _kept(self, contact: Choice, time: Any, state: Travel, stays: tuple[Any, ...]) -> tuple[Travel, Any]:
         """The state with the supports that a ball is on after an impact, and whether there are any."""
-        any_, is_hit = functools.reduce(operator.or_, stays), contact.index < self.scene.n_contacts
+        any_, is_exit = functools.reduce(operator.or_, stays), contact.index >= self.scene.n_contacts
         if self.have_grooves:
             first, second = where(stays[0], phase_of(state), second_of(state)), where(stays[0], second_of(state), -1)
-            kept = support_of(first, where(stays[1], second, -1), jnp.result_type(state.support))
-            state = state._replace(support=where(is_hit & any_ & (second_of(state) >= 0), kept, state.support))
-        return state, (state.support >= 0) & (any_ | ~is_hit)
+            kept = support_of(first, where(stays[1], second, -1), time.dtype)
+            state = state._replace(support=where(any_ & ~is_exit & (second_of(state) >= 0), kept, state.support))
+        return state, (state.support >= 0) & (any_ | is_exit)
 
     def touch(
         self,
@@ -87,7 +88,7 @@ class Settling(Grooved):
     ) -> Touch:
         """`stays` says on which of its supports a ball still is after an impact."""
         floors, onto = self.floors, None
-        state, on = self._kept(contact, state, stays)
+        state, on = self._kept(contact, time, state, stays)
         if self.joins:  # on a face that is flush with its support it is no less on that
             face, _ = floors.face(self.scene.choice(phase_of(state)), state.flight.position, time)
             onto = self._onto(contact.index, self._flush(time, state, face.normal), time)
@@ -389,8 +390,8 @@ class Settling(Grooved):
     def during(self, contact: Choice, time: Any, state: Travel, elapsed: Any) -> Travel:
         """The state so long after the first impact of a train."""
         n, struck, _ = self.scene.struck(contact, time, state.flight)
-        alone = state._replace(support=jnp.full_like(time, -1.0))
-        touch = self.touch(contact, time, alone, n, struck, self.pull(time, struck), (False, False))
+        flies = state._replace(support=-1.0)
+        touch = self.touch(contact, time, flies, n, struck, self.pull(time, struck), (False, False))
         first, law = touch.first, touch.law
         last = train.bounced(first, law, touch.slips, train.bounces_within(first, law.restitution, elapsed))
         velocity = add(last.velocity, scale(last.rise, first.normal))

@@ -53,9 +53,6 @@ class Flight(NamedTuple):
     orientation: Any
 
 
-_NONE = Support(-1, None, False)
-
-
 class Scene(AbstractSystem):
     """A ball and what it can hit.
 
@@ -184,7 +181,7 @@ class Scene(AbstractSystem):
     def restitution(self, contact: Choice) -> Number:
         return contact.of([surface.law.restitution for surface in self.chosen(contact)])
 
-    def struck(self, contact: Choice, time: Any, state: Flight, supports: tuple[Support, ...] = (_NONE,)) -> tuple:
+    def struck(self, contact: Choice, time: Any, state: Flight, supports: tuple[Support, ...] = ()) -> tuple:
         """The normal of a contact, the state after an impact there, and on which of its supports a ball still is then:
         by Theorem 5.2, for any normal and any law; where it touches several surfaces, on all of them."""
         normals = [surface.direction(state.position, time) for surface in self.chosen(contact)]

@@ -239,7 +239,9 @@ def _nearby(scene: Any, time: Any, struck: Any, state: Any, supports: tuple[Supp
     x, count = state.position, scene.n_contacts
     here = _every(scene, lambda each: _seen(scene, each, time, state))
     numbers = numbers_of(scene)
-    is_support = jnp.stack([numbers == each.index for each in supports])
+    is_support = jnp.zeros((0, count), bool)
+    if supports:
+        is_support = jnp.stack([numbers == each.index for each in supports])
     held = jnp.any(is_support, axis=0)
     touched = (abs(here.gap) <= _TOUCHING * here.noise) | (numbers == struck) | held
     pick: Callable = lambda values: values  # noqa: E731
