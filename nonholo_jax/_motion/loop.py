@@ -266,6 +266,7 @@ def turn(
     kept, control = motion.judge(c.control, size, piece.trial, stays)
     found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
     kept, control = _ending_there(system, motion, arc, found, kept, stays, control)
+    kept, control = _looking_often(system, motion, arc, kept, stays, control)
     kept, finished = _shared_flags((kept, found.finished))
     ended = active & kept & finished
     crossed, contact = ended & (found.contact >= 0), system.choice(found.contact)
@@ -349,6 +350,19 @@ def _ending_there(
     inside = inside & (path > _tiny(arc, found.s))
     early = stays & kept & found.finished & (found.contact >= 0) & inside
     return kept & ~early, keep(early, shortened, control)
+
+
+def _looking_often(
+    system: AbstractSystem, motion: AbstractMotion, arc: Any, kept: Any, stays: Any, control: Any
+) -> tuple[Any, Any]:
+    """A step along a surface is not kept where it may have passed a dent unseen, but for what is below rounding."""
+    coarse = system.is_coarse(arc)
+    shortened = motion.shortened(control, 0.5 * frozen(arc.length * arc.unit))
+    if coarse is None or shortened is None:
+        return kept, control
+    path = norm(frozen(arc.tangent(0.0 * arc.length))[:3]) * arc.length
+    coarse = stays & kept & coarse & (path > _tiny(arc, arc.length))
+    return kept & ~coarse, keep(coarse, shortened, control)
 
 
 def allowed(c: Carry, max_impacts: int) -> Any:

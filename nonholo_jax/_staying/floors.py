@@ -1,6 +1,7 @@
 """The surfaces of a scene that a ball may stay on."""
 
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._impact import AbstractContactLaw, Contact, along_surface, rolling
-from .._math import Choice, Number, Vector3, components, dot, is_constant, norm, ratio, scale, slope
-from .._world import AbstractSurface, Face, Scene, Stack
+from .._math import Choice, Number, Vector3, Window, components, dot, frozen, is_constant, norm, ratio, scale, slope
+from .._world import AbstractSurface, Face, Implicit, Member, Scene, Stack
 
 
 def can_settle(surface: AbstractSurface, curved: bool = False) -> bool:
@@ -27,6 +28,25 @@ def can_settle(surface: AbstractSurface, curved: bool = False) -> bool:
 def is_elastic(surface: AbstractSurface) -> bool:
     """Whether bounces on a surface are known never to die out."""
     return is_constant(surface.law.restitution) and bool(surface.law.restitution == 1)
+
+
+def is_coarse(scene: Any, arc: Any, is_on: Callable[[Any], Any]) -> Any:
+    """Whether a step along a surface is so long that, by the bounds of how its level bends, a dent or a ridge of a
+    thousandth of the radius may lie between the places where the step has looked; `None` where all of them are known by
+    a few numbers."""
+    path, most = frozen(tuple(arc.configuration[:3])), 1e-3 * scene.ball.radius
+
+    def strays(each: Member) -> Any:
+        low, high = each.surface.bend(Window(path, arc.length), arc.time, scene.ball.radius)
+        aside = jnp.maximum(abs(low), abs(high)) * arc.length * arc.length / 8.0
+        return jnp.where(is_on(each.number), aside > most, False)
+
+    found = []
+    for each in scene.contacts():
+        kind = each.surface if isinstance(each, Member) else each[1].first
+        if isinstance(kind, Implicit) and kind.is_bounded():
+            found.append(strays(each) if isinstance(each, Member) else jnp.any(each[1].each(each[0], strays)))
+    return functools.reduce(operator.or_, found) if found else None
 
 
 class Floors:

@@ -36,7 +36,7 @@ from .._math import (
     where_vector,
 )
 from .._world import AbstractSystem, Meeting, Member, Scene, along, bounces, may_be_flush, round_bend, round_level
-from .floors import Floors
+from .floors import Floors, is_coarse
 from .ground import Ground, Travel, code_of, of_code, phase_of, second_of, support_of
 from .settling import Settling
 
@@ -94,13 +94,8 @@ class Grounded(AbstractSystem):
     def _floors(self) -> Floors:
         return Floors(self.scene, self.curved)
 
-    @property
-    def _n_surfaces(self) -> int:
-        return self.scene.n_contacts
-
-    @property
-    def _end_of_slip(self) -> int:
-        return self._settling.end_of_slip
+    _n_surfaces = property(lambda self: self.scene.n_contacts)
+    _end_of_slip = property(lambda self: self._settling.end_of_slip)
 
     @property
     def n_contacts(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -209,6 +204,9 @@ class Grounded(AbstractSystem):
         inside, (sides, spin, course) = second_of(state) >= 0, settling.along_groove(time, state, below, q, v)
         first, *others = settling.ends_in_groove(state, below, sides, spin, v, course)
         return where(on, where(inside, first, hold), 1.0), *[where(inside, x, 1.0) for x in others]
+
+    def is_coarse(self, arc):
+        return is_coarse(self.scene, arc, functools.partial(self._is_on, arc.start)) if self.curved else None
 
     def rate_of(self, time, state):
         return state.flight.velocity

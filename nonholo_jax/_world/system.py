@@ -42,6 +42,10 @@ class AbstractSystem(eqx.Module):
         del time, state, q, v
         return ()
 
+    def is_coarse(self, arc: Any) -> Any:
+        """Whether a step along a surface may have passed a part of it unseen; `None` where that cannot be."""
+        del arc
+
     def code(self, state: Any) -> Index:
         """`phase`, with all that the log has to know of it."""
         return self.phase(state)

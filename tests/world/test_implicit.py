@@ -341,3 +341,38 @@ def test_a_ball_flies_off_where_the_curvature_jumps(speed):
     rolls = BallState([-0.2, 0.0, SIZE], [speed, 0.0, 0.0], [0.0, speed / SIZE, 0.0])
     out, late = simulate(scene, rolls, t1=0.2 / speed + 0.05), 0.05
     np.testing.assert_allclose(out.final.position, (speed * late, 0.0, SIZE - 4.905 * late**2), rtol=0, atol=1e-12)
+
+
+def dent_times(x, v, depth, width, end, alpha=0.4):
+    """How long a ball rolls from x to `end` through a dent at 0: by the energy that it keeps."""
+    s = np.linspace(x, end, 400_001)
+    z = -depth * np.exp(-((s / width) ** 2))
+    speed = np.sqrt(v * v - 2.0 * 9.81 * z / (1.0 + alpha))
+    ways = np.sqrt(1.0 + (2.0 * s / width**2 * z) ** 2) / speed
+    return np.sum(0.5 * (ways[1:] + ways[:-1]) * np.diff(s))
+
+
+@pytest.mark.parametrize("depth", [0.004, -0.002])
+def test_no_dent_is_passed_between_two_steps(depth):
+    """On a level floor steps become as long as the way; however far before the dent the ball begins."""
+    width, v = 0.03, 0.5
+
+    @jax.jit
+    @jax.vmap
+    def roll(x, t1):
+        floor = Implicit(lambda x, t: x[2] - 0.05 + depth * jnp.exp(-((x[0] / width) ** 2)), Rough(0.0))
+        state = BallState(
+            jnp.stack([x, 0 * x, 0.05 + 0 * x]), jnp.array([v, 0.0, 0.0]), jnp.array([0.0, v / 0.05, 0.0])
+        )
+        motion = Exact(contact=Integrated(rtol=1e-9, atol=1e-9))
+        out = simulate(
+            Scene(Ball(0.05, 1.0), {"floor": floor}), state, t1=t1, motion=motion, max_impacts=4, throw=False
+        )
+        return out.result, out.final
+
+    starts = -np.array([0.2, 0.31, 0.47, 0.6, 0.83, 1.3])
+    times = np.array([dent_times(x, v, depth, width, 0.3) for x in starts])
+    result, final = roll(jnp.asarray(starts), jnp.asarray(times))
+    assert np.all(np.asarray(result._value) == RESULTS.reached_t1._value)
+    np.testing.assert_allclose(final.position[:, 0], 0.3, atol=1e-7)
+    np.testing.assert_allclose(final.velocity[:, 0], v, atol=1e-7)
