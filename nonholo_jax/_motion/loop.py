@@ -266,7 +266,6 @@ def turn(
     kept, control = motion.judge(c.control, size, piece.trial, stays)
     found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
     kept, control = _ending_there(system, motion, arc, found, kept, stays, control)
-    kept, control = _looking_often(system, motion, arc, kept, stays, control)
     kept, finished = _shared_flags((kept, found.finished))
     ended = active & kept & finished
     crossed, contact = ended & (found.contact >= 0), system.choice(found.contact)
@@ -339,9 +338,11 @@ def _ending_there(
 ) -> tuple[Any, Any]:
     """What ends a contact is found on an interpolant, which is best at both ends of a step: where it is further from
     them, the step is not kept, and the next one ends just behind it. Not below rounding: where the curvature of a
-    surface jumps, so does what holds the ball there, and every step would end before the jump."""
+    surface jumps, so does what holds the ball there, and every step would end before the jump. A step that is too long
+    to see the surface (`_looking_often`) is not kept either."""
     if system.n_derived == 0:
         return kept, control
+    kept, control = _looking_often(system, motion, arc, kept, stays, control)
     shortened = motion.shortened(control, (1.0 + 1e-5) * frozen(found.s * arc.unit))
     if shortened is None:
         return kept, control
