@@ -68,19 +68,29 @@ def later_heading(slip: Vector3, known: Vector3) -> Vector3:
     return tuple(jnp.where(size > 0, ratio(u, size), k) for u, k in zip(mirrored, known, strict=True))  # pyright: ignore
 
 
+def carried(normal: Vector3, known: Vector3) -> Vector3:
+    """A direction along a surface that is kept, where the normal has become this one; zero if it was zero."""
+    here = along_surface(normal, known)
+    size = norm(here)
+    return tuple(jnp.where(size > 0, ratio(u, size), 0.0) for u in here)  # pyright: ignore
+
+
 def is_straight(known: Vector3, along: Vector3, pull: Number) -> Any:
     """Whether gravity along the surface leaves the direction of the slip as it is."""
     eps = float(jnp.finfo(jnp.result_type(*known)).eps)
     return (dot(known, known) == 0) | (_sideways(known, along) <= 64.0 * eps * abs(pull))
 
 
-def stays_straight(known: Vector3, slip: Vector3, along: Vector3, most: Number, tolerance: float) -> Any:
+def stays_straight(
+    known: Vector3, slip: Vector3, along: Vector3, most: Number, tolerance: float, least: Number = 0.0
+) -> Any:
     """Whether the end of the slip is so near that its direction may be kept, for a velocity of 100 `tolerance` and a
     way of `tolerance` (m/s and m). The direction settles at the rate |g_t| / |u|, which is faster than any explicit
-    solver can follow: where friction hardly exceeds gravity, it would not come to the end without this."""
+    solver can follow: where friction hardly exceeds gravity, it would not come to the end without this. A slip that
+    decays at the rate `least` or less may as well be one that has just begun."""
     decay, speed = most - dot(known, along), norm(slip)
     aside = ratio(speed * _sideways(known, along), norm(along))
-    return (decay > 0) & (aside <= 100.0 * tolerance) & (aside * speed <= tolerance * decay)
+    return (decay > least) & (aside <= 100.0 * tolerance) & (aside * speed <= tolerance * decay)
 
 
 def _sideways(known: Vector3, along: Vector3) -> Number:

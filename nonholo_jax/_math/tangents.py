@@ -29,7 +29,7 @@ class Iteration(NamedTuple):
     begin: (
         Callable  # of the arguments: what stays (a pytree without derivatives) and what moves (floating-point arrays)
     )
-    parts: Callable  # of what stays, and of the hint: how many parts there are, the same for all lanes
+    parts: Callable  # of what stays, and of the hint: how many parts there are, as it seems, the same for all lanes
     look: Callable  # of the arguments, the number of the part, and what stays: the latter, afterwards; how many steps
     # the part has; and their rows, a pytree of arrays with an axis in front
     harmless: Callable  # of the arguments, and of what stays: arguments with which idle steps are numbers, too
@@ -147,14 +147,13 @@ def tangent_of(
         return residuals[0], arguments, [x for m, x in zip(moves, residuals[1:], strict=True) if m]
 
     def forward(iteration: Iteration, residuals: Any, numbers: Any) -> list:
-        return jax.tree.leaves(_pushed(iteration, *split(residuals), list(numbers)))
+        return jax.tree.leaves(_pushed(iteration, *split(residuals)[1:], list(numbers)))
 
     def backward(iteration: Iteration, residuals: Any, numbers: Any) -> list:
         return _pulled(iteration, *split(residuals), jax.tree.unflatten(jax.tree.structure(like), numbers))
 
     def plain(residuals: Any, moving: Any) -> list:
-        hint, arguments, _ = split(residuals)
-        return jax.tree.leaves(_all_steps(iteration, hint, arguments, moving))
+        return jax.tree.leaves(_all_steps(iteration, split(residuals)[1], moving))
 
     def plain_forward(residuals: Any, numbers: Any) -> list:
         at = split(residuals)[2]
@@ -174,13 +173,13 @@ def tangent_of(
     return jax.tree.unflatten(jax.tree.structure(like), out)
 
 
-def _pushed(iteration: Iteration, hint: Any, arguments: Callable, at: list, numbers: list) -> Any:
+def _pushed(iteration: Iteration, arguments: Callable, at: list, numbers: list) -> Any:
     """The tangent of what is asked for."""
     begin = lambda at: iteration.begin(arguments(at))[::-1]  # noqa: E731
     moving, tangent, stays = jax.jvp(begin, (at,), (numbers,), has_aux=True)
 
-    def part(i: Any, carry: tuple) -> tuple:
-        stays, tangent, table = carry
+    def part(state: tuple) -> tuple:
+        i, (stays, tangent, table) = state
         stays, count, rows = iteration.look(arguments(at), i, stays)
 
         def one(j: Any, carry: tuple) -> tuple:
@@ -191,13 +190,19 @@ def _pushed(iteration: Iteration, hint: Any, arguments: Callable, at: list, numb
             used = j < count
             return _kept(used, new, tangent), _entered(table, iteration.place(row), used, record)
 
-        return stays, *lax.fori_loop(0, eqxi.unvmap_max(count), one, (tangent, table))
+        return i + 1, (stays, *lax.fori_loop(0, eqxi.unvmap_max(count), one, (tangent, table)))
 
-    first = (stays, tangent, jnp.asarray(iteration.table))
-    parts = iteration.parts(stays, hint)
-    stays, tangent, table = part(0, first) if iteration.most == 1 else lax.fori_loop(0, parts, part, first)
+    first = (jnp.asarray(0), (stays, tangent, jnp.asarray(iteration.table)))
+    goes_on = lambda state: (state[0] < iteration.most) & _goes_on(iteration, state[1][0])  # noqa: E731
+    _, (stays, tangent, table) = part(first) if iteration.most == 1 else lax.while_loop(goes_on, part, first)
     asked = jax.jvp(iteration.of, (moving, jnp.asarray(iteration.table)), (tangent, table))[1]
     return _known(iteration.finished(stays), asked)
+
+
+def _goes_on(iteration: Iteration, stays: Any) -> Any:
+    """Whether a lane needs more parts. A hint only guesses at how many there are: the steps of a solver at the limit of
+    its stability depend on rounding, and another program rounds otherwise."""
+    return eqxi.unvmap_any(~iteration.finished(stays))
 
 
 def _row(rows: Any, j: Any) -> Any:
@@ -220,7 +225,7 @@ def _record(table: Any, place: Any) -> Any:
 
 
 def _known(finished: Any, numbers: Any) -> Any:
-    """NaN where steps are missing: where rounding has led a chaotic motion to a path that is longer than its hint."""
+    """NaN where steps are missing, which none should be."""
     return jax.tree.map(lambda x: jnp.where(finished, x, jnp.nan), numbers)
 
 
@@ -230,6 +235,7 @@ class _Pull(NamedTuple):
     part: Any  # which is looked through next, and what it begins with
     stays: Any
     goal: Any  # the part whose transpose comes next
+    last: Any  # the part that seems to be the last one, and with which the way back begins
     kept: Any  # what parts begin with, in slots
     cotangent: Any
     sums: Any
@@ -250,7 +256,9 @@ def _pulled(iteration: Iteration, hint: Any, arguments: Callable, at: list, cota
 
     def job(c: _Pull) -> _Pull:
         stays, count, rows = iteration.look(arguments(at), c.part, c.stays)
-        here = c.part == c.goal
+        # Where steps are missing after the last part, there is another one behind it.
+        behind = (c.part == c.last) & (c.goal == c.last) & (c.part + 1 < iteration.most) & _goes_on(iteration, stays)
+        here = (c.part == c.goal) & ~behind
         steps = jnp.where(here, eqxi.unvmap_max(count), 0)
 
         def one(k: Any, carry: tuple) -> tuple:
@@ -266,16 +274,25 @@ def _pulled(iteration: Iteration, hint: Any, arguments: Callable, at: list, cota
         cotangent, sums = lax.fori_loop(0, steps, one, (c.cotangent, c.sums))
         if iteration.most == 1:
             return c._replace(stays=stays, cotangent=cotangent, sums=sums, goal=c.goal - 1)
-        on, goal = c.part + 1, jnp.where(here, c.goal - 1, c.goal)
+        on, goal = c.part + 1, jnp.where(here, c.goal - 1, jnp.where(behind, c.goal + 1, c.goal))
         slot = jnp.where(here | (on % stride != 0), slots, on // stride)
         kept = jax.tree.map(lambda column, x: column.at[slot].set(x, mode="drop"), c.kept, stays)
-        nearest = jnp.maximum(goal, 0) // stride
-        finished = c.finished | (here & (c.goal == parts - 1) & iteration.finished(stays))
+        nearest = jnp.clip(goal // stride, 0, slots - 1)
+        finished = c.finished | (here & (c.goal == c.last) & iteration.finished(stays))
         stays = _kept(here, _row(kept, nearest), stays)
-        return _Pull(jnp.where(here, nearest * stride, on), stays, goal, kept, cotangent, sums, finished)
+        return _Pull(
+            jnp.where(here, nearest * stride, on),
+            stays,
+            goal,
+            jnp.maximum(c.last, goal),
+            kept,
+            cotangent,
+            sums,
+            finished,
+        )
 
     zero = jnp.zeros_like(parts)
-    first = _Pull(zero, stays, parts - 1, kept, cotangent, sums, iteration.finished(stays))
+    first = _Pull(zero, stays, parts - 1, parts - 1, kept, cotangent, sums, iteration.finished(stays))
     if iteration.most == 1:
         last = lax.cond(parts > 0, job, lambda c: c, first._replace(goal=zero))
         last = last._replace(finished=iteration.finished(last.stays))
@@ -284,10 +301,9 @@ def _pulled(iteration: Iteration, hint: Any, arguments: Callable, at: list, cota
     return _known(last.finished, jax.tree.map(jnp.add, last.sums, pull(last.cotangent)[0]))
 
 
-def _all_steps(iteration: Iteration, hint: Any, arguments: Callable, at: Any) -> Any:
+def _all_steps(iteration: Iteration, arguments: Callable, at: Any) -> Any:
     """What moves in the end, in a way that JAX can differentiate as often as one likes."""
     stays, moving = iteration.begin(arguments(at))
-    parts = iteration.parts(stays, hint)
 
     def part(carry: tuple, i: Any) -> tuple:
         def run(carry: tuple) -> tuple:
@@ -308,7 +324,7 @@ def _all_steps(iteration: Iteration, hint: Any, arguments: Callable, at: Any) ->
             index = jnp.arange(jax.tree.leaves(rows)[0].shape[0], dtype=jnp.int32)
             return stays, *lax.scan(jax.checkpoint(one, prevent_cse=False), tuple(rest), (index, rows))[0]
 
-        return lax.cond(i < parts, run, lambda carry: carry, carry), None
+        return lax.cond(_goes_on(iteration, carry[0]), run, lambda carry: carry, carry), None
 
     first = (stays, moving, jnp.asarray(iteration.table))
     body = part if iteration.most == 1 else jax.checkpoint(part, prevent_cse=False)

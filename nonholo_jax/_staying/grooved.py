@@ -72,7 +72,7 @@ class Grooved(Footing):
         rub = None
         if below.slides is not None:
             slips = groove.slips(self.scene.ball.radius, sides, v, spin)  # pyright: ignore[reportArgumentType]
-            rub = groove.Rub(below.slides.limits, self._headings(below, slips))
+            rub = groove.Rub(below.slides.limits, self._headings(below, slips, sides))
         return sides, spin, self.course(time, state.flight._replace(position=x), sides, v, spin, rub)  # pyright: ignore
 
     def spin_in_groove(
@@ -89,13 +89,14 @@ class Grooved(Footing):
         return sides, groove.spin_of(path, dot(path.along, v), pivot, kept, sides.grips[0] | sides.grips[1])
 
     @staticmethod
-    def _headings(below: Ground, slips: tuple) -> tuple[Vector3, Vector3]:
+    def _headings(below: Ground, slips: tuple, sides: groove.Sides) -> tuple[Vector3, Vector3]:
         """The directions of the slips on both sides, some time after the arc began."""
         assert below.slides is not None
         found = []
-        for slip, known, straight in zip(slips, below.slides.headings, below.slides.straight, strict=True):
+        known_then = zip(slips, below.slides.headings, below.slides.straight, sides.normals, strict=True)
+        for slip, known, straight, normal in known_then:
             slides = dot(known, known) > 0
-            later = where_vector(straight, known, rolling.later_heading(slip, known))
+            later = where_vector(straight, rolling.carried(normal, known), rolling.later_heading(slip, known))
             found.append(where_vector(slides, later, rolling.NONE))
         return found[0], found[1]
 

@@ -253,7 +253,9 @@ class Footing:
             drive = add(drive, scale(where(dot(slip, slip) > 0, 0.0, 1.0 + 1.0 / alpha), slowed))
         most = where(slides, friction, 0.0) * push * (1.0 + 1.0 / alpha)
         heading = where_vector(slides, rolling.heading(slip, drive, most), rolling.NONE)
-        straight = self.parabolic or rolling.stays_straight(heading, slip, drive, most, self.tolerance)
+        straight = self.parabolic or rolling.stays_straight(
+            heading, slip, drive, most, self.tolerance, self._balance(most)
+        )
         if brake is not None:
             slides = dot(heading, heading) > 0
             brake = brake._replace(coefficient=where(slides, 0.0, brake.coefficient), holds=brake.holds & ~slides,
@@ -271,6 +273,11 @@ class Footing:
         eps, radius = self._eps(flight), self.scene.ball.radius
         size = norm(flight.velocity) + radius * norm(flight.spin) + root(radius * norm(components(self.scene.gravity)))
         return 4.0 * self.tolerance * (1.0 + size) + max(eps**0.75, 1024.0 * eps) * size
+
+    def _balance(self, most: Number) -> Number:
+        """By how much friction may seem to exceed what drives a ball whose slip has just begun: the moment at which
+        that begins is known to the tolerance of a step."""
+        return 1e3 * self.tolerance * most if self.follows_hold else 0.0
 
     def last_slip(self, flight: Flight, slip: Vector3) -> Number:
         """The slip at which one that was `slip` at the beginning of an arc counts as over: not so small that a step
@@ -433,23 +440,25 @@ class Footing:
         assert brake is not None
         share, heading = ratio(1.0, 1.0 + self.scene.ball.inertia_ratio), brake.heading
         if not self.parabolic:
-            heading = where_vector(brake.straight, heading, rolling.later_heading(v, heading))
+            kept = rolling.carried(forced.normal, heading) if self.curved else heading
+            heading = where_vector(brake.straight, kept, rolling.later_heading(v, heading))
         against = scale(brake.coefficient * -forced.push, heading)
         driven = scale(share, add(forced.along, scale(self.scene.ball.inertia_ratio, forced.twist)))
         return where_vector(brake.holds, driven, against)
 
-    def slip_rate(self, below: Ground, slip: Vector3, along: Vector3, push: Number) -> Vector3:
-        """The rate of the slip, zero for a ball that does not slide against friction."""
+    def slip_rate(self, below: Ground, slip: Vector3, along: Vector3, forced: Forced) -> Vector3:
+        """The rate of the slip, zero for a ball that does not slide against friction; `along` drives it."""
         slides, heading = dot(below.heading, below.heading) > 0, below.heading
         assert below.friction is not None
-        most = where(slides, below.friction, 0.0) * -push
+        most = where(slides, below.friction, 0.0) * -forced.push
         most = most * (1.0 + 1.0 / self.scene.ball.inertia_ratio)
-        rate = scale(dot(along, heading) - most, heading)
+        kept = rolling.carried(forced.normal, heading) if self.curved else heading
+        rate = scale(dot(along, kept) - most, kept)
         if not self.parabolic:
             towards = rolling.later_heading(slip, heading)
             if self.follows_hold:
                 # A slip that has just begun follows what drives it, faster than an explicit solver can.
-                begins = (dot(along, heading) > most) & (norm(slip) <= self.tolerance**0.5)
+                begins = (dot(along, heading) > most - self._balance(most)) & (norm(slip) <= self.tolerance**0.5)
                 towards = where_vector(begins, scale(ratio(1.0, norm(along)), along), towards)
             turning = subtract(along, scale(most, towards))
             rate = where_vector(below.straight, rate, turning)

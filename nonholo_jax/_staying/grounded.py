@@ -143,7 +143,7 @@ class Grounded(AbstractSystem):
         n, rate = forced.normal, forced.along
         if self.curved:
             rate = subtract(rate, forced.twist)
-        changes = settling.slip_rate(below, slip, rate, forced.push) if slip else ()
+        changes = settling.slip_rate(below, slip, rate, forced) if slip else ()
         if self.curved:
             rate = add(rate, scale(1.0 + alpha, forced.twist))
         if slip:

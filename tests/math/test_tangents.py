@@ -40,7 +40,7 @@ def look(size):
             going = i[each] < count
             now, total = jnp.where(going, new["x"], now), jnp.where(going, new["sum"], total)
         rows = jax.tree.map(lambda *columns: jnp.stack(columns), *rows)
-        return {**stays, "moving": (now, total)}, jnp.clip(count - i[0], 0, size), rows
+        return {**stays, "moving": (now, total), "done": count <= i[-1] + 1}, jnp.clip(count - i[0], 0, size), rows
 
     return look
 
@@ -60,30 +60,31 @@ def plainly(x, shared, count):
     return asked(moving, table)
 
 
-def iteration(steps, parts, finished=True):
-    """All lanes look through the same number of parts, some of them idle."""
+def iteration(steps, parts, finishes=True, missing=0):
+    """All lanes look through the same number of parts, some of them idle; the hint may be some parts short."""
     size = PARTS[parts]
 
     def starts(arguments):
         stays, moving = begin(arguments)
+        stays["done"] = arguments[2] <= 0
         return {**stays, "moving": jax.lax.stop_gradient((moving["x"], moving["sum"]))}, moving
 
     return Iteration(
         begin=starts,
-        parts=lambda _, hint: -(-steps // size) + 0 * hint,
+        parts=lambda _, hint: max(-(-steps // size) - missing, min(steps, 1)) + 0 * hint,
         look=look(size),
         harmless=lambda arguments, _: arguments,
         starts=lambda row: {"x": row["x"], "sum": row["sum"]},
         step=step,
         place=lambda row: row["i"],
         table=np.zeros((MOST, 2)),
-        finished=lambda _: jnp.asarray(finished),
+        finished=lambda stays: stays["done"] & finishes,
         of=asked,
         most=parts,
     )
 
 
-def tiled(steps, tile, finished=True, parts=5):
+def tiled(steps, tile, finishes=True, parts=5, missing=0):
     @jax.custom_jvp
     def run(x, shared, count):
         return plainly(x, shared, count)
@@ -93,7 +94,7 @@ def tiled(steps, tile, finished=True, parts=5):
         like = run(*primals)
         along = (*tangents[:2], None)
         hint = jnp.asarray(0, dtype=jnp.int32)
-        way = iteration(steps, parts, finished)
+        way = iteration(steps, parts, finishes, missing)
         return like, tangent_of(way, way, primals, along, hint, like, tile)
 
     return run
@@ -147,8 +148,19 @@ def test_lanes_within_and_around_the_derivative():
         np.testing.assert_allclose(other, exact, rtol=1e-12)
 
 
-def test_a_path_that_is_longer_than_its_hint_has_no_silent_derivative():
+@pytest.mark.parametrize("missing", [1, 3, 20])
+@pytest.mark.parametrize("steps, parts", [(9, 5), (20, 5), (20, 20)])
+def test_a_path_that_is_longer_than_its_hint_is_followed_to_its_end(steps, parts, missing):
+    given = (*numbers(7)[:2], jnp.asarray([0, 20, 3, 1, 9, 20, 5], dtype=jnp.int32))
+    truth = jax.grad(over_lanes(plainly, steps), argnums=(0, 1))(*given)
+    own = over_lanes(tiled(steps, 4, parts=parts, missing=missing), steps)
+    for way in (jax.grad, jax.jacfwd, jax.jacrev):
+        for one, true in zip(jax.jit(way(own, argnums=(0, 1)))(*given), truth, strict=True):
+            np.testing.assert_allclose(one, true, rtol=1e-12)
+
+
+def test_a_path_that_does_not_end_has_no_silent_derivative():
     given = numbers(3)
-    run = over_lanes(tiled(2, 4, finished=False), 2)
+    run = over_lanes(tiled(2, 4, finishes=False), 2)
     assert np.all(np.isnan(jax.grad(run)(*given)))
     assert np.all(np.isnan(jax.jacfwd(run)(*given)))
