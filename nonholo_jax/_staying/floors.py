@@ -2,6 +2,7 @@
 
 import functools
 import operator
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,7 +14,26 @@ import numpy as np
 
 from .._impact import AbstractContactLaw, Contact, along_surface, rolling
 from .._math import Choice, Number, Vector3, Window, components, dot, frozen, is_constant, norm, ratio, scale, slope
-from .._world import AbstractSurface, Face, Implicit, Member, Scene, Stack
+from .._world import AbstractSurface, Face, Implicit, Member, Scene, Stack, may_be_flush
+
+
+def _asked_once(question: Callable) -> Callable:
+    """A question about a scene, and other arguments that can be hashed, whose answer is kept as long as the scene is: a
+    call of a compiled program would else spend longer on such questions than the program runs."""
+    answers: dict[tuple, tuple[weakref.ref, Any]] = {}
+
+    @functools.wraps(question)
+    def answer(scene: Any, *rest: Any) -> Any:
+        key = (id(scene), *rest)
+        known = answers.get(key)
+        if known is not None and known[0]() is scene:
+            return known[1]
+        found = question(scene, *rest)
+        if not any(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(scene)):  # their numbers may change
+            answers[key] = (weakref.ref(scene, lambda _: answers.pop(key, None)), found)
+        return found
+
+    return answer
 
 
 def can_settle(surface: AbstractSurface, curved: bool = False) -> bool:
@@ -164,6 +184,19 @@ def _rolls(law: AbstractContactLaw) -> Any:
     return bool(law.rolls) if law.sliding_friction() is None else _friction(law) > 0
 
 
+@_asked_once
+def may_settle(scene: Scene, curved: bool) -> bool:
+    """Whether there is a surface that a ball may stay on."""
+    return bool(Floors(scene, curved).indices)
+
+
+@_asked_once
+def may_pass(scene: Scene, curved: bool) -> bool:
+    """Whether a ball may come from one face, or part of a surface, onto another without an impact."""
+    return (curved and Floors(scene, curved).n_seams > 0) or may_be_flush(scene.surfaces, scene.ball.radius)
+
+
+@_asked_once
 def stays_curved(scene: Scene, edges: bool | None) -> bool:
     """Whether a ball is to be followed where it stays on a surface that is not flat; `edges` is that of `Integrated`.
     From the outside of spheres and cylinders it soon rolls off, so that only those that hold it count here."""
@@ -175,6 +208,7 @@ def stays_curved(scene: Scene, edges: bool | None) -> bool:
     return any(can_settle(each, curved=True) and not is_elastic(each) for each in hollow)
 
 
+@_asked_once
 def slides_across(scene: Scene) -> bool:
     """Whether a ball is known now, not only when the program runs, to meet a slope that it may slide across."""
     if any(isinstance(leaf, jax.core.Tracer) or np.ndim(leaf) > 1 for leaf in jax.tree.leaves(scene)):

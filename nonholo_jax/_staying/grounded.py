@@ -35,8 +35,8 @@ from .._math import (
     where,
     where_vector,
 )
-from .._world import AbstractSystem, Meeting, Member, Scene, along, bounces, may_be_flush, round_bend, round_level
-from .floors import Floors, is_coarse
+from .._world import AbstractSystem, Meeting, Member, Scene, along, bounces, round_bend, round_level
+from .floors import Floors, is_coarse, may_pass, may_settle
 from .ground import Ground, Travel, code_of, of_code, phase_of, second_of, support_of
 from .settling import Settling
 
@@ -71,12 +71,11 @@ class Grounded(AbstractSystem):
         tolerance: float = 0.0,
         parabolic: bool = False,
         hits: bool = True,
-        may_pass: bool | None = None,
+        may_pass: bool = False,
         curved: bool = False,
     ):
         self.scene, self.tolerance, self.parabolic, self.hits = scene, tolerance, parabolic, hits
-        self.curved, has_seams = curved, curved and Floors(scene, curved).n_seams > 0
-        self.may_pass = has_seams or may_be_flush(scene.surfaces, scene.ball.radius) if may_pass is None else may_pass
+        self.curved, self.may_pass = curved, may_pass
 
     @property
     def is_long(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -493,4 +492,6 @@ def _as_arrays(tree: Any, time: Any) -> Any:
 
 def grounded(scene: Scene, tolerance: float, parabolic: bool, curved: bool = False) -> Scene | Grounded:
     """A scene with the motion after the last bounce, if there can be a last one."""
-    return Grounded(scene, tolerance, parabolic, curved=curved) if Floors(scene, curved).indices else scene
+    if not may_settle(scene, curved):
+        return scene
+    return Grounded(scene, tolerance, parabolic, may_pass=may_pass(scene, curved), curved=curved)

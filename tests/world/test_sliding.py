@@ -3,6 +3,7 @@
 import dataclasses
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +28,7 @@ from nonholo_jax import (
     slip,
 )
 from nonholo_jax._math.types import kind_name
+from nonholo_jax._staying.floors import _asked_once
 
 R, MASS, ALPHA, G = 0.1, 0.7, 0.4, 9.81
 BALL = Ball(R, MASS, ALPHA)
@@ -360,3 +362,26 @@ def test_times_between_of_a_batch_that_slides_and_rolls(motion, dtype):
     right = place[:, None] + speed[:, None] * (np.asarray(ts, float)[None, :, None] - until[:, None, None])
     error = np.abs(np.asarray(batch.at(ts).position) - right).max(axis=-1)
     assert np.where(later, error, 0.0).max() < 64 * eps * np.abs(right).max()
+
+
+def test_what_is_known_of_a_scene_is_asked_once_for_each():
+    """As long as it is there, and where none of its numbers may change."""
+    asked = []
+
+    @_asked_once
+    def question(scene, detail):
+        asked.append(detail)
+        return float(scene.surfaces[0].law.restitution), detail
+
+    def scene(restitution, point=(0.0, 0.0, 0.0)):
+        return Scene(Ball(0.1, 1.0), {"floor": Plane(point, (0, 0, 1), Rough(restitution))})
+
+    for e in (0.25, 0.5, 0.75):  # each may lie where the one before has lain
+        one = scene(e)
+        for detail in (True, False, True):
+            assert question(one, detail) == (e, detail)
+    assert asked == 3 * [True, False]
+    changed = eqx.tree_at(lambda each: each.surfaces[0].law.restitution, one, np.array(0.3))
+    for e in (0.3, 0.4):
+        changed.surfaces[0].law.restitution[...] = e
+        assert question(changed, True) == (e, True)
