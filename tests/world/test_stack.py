@@ -11,7 +11,9 @@ from nonholo_jax import (
     Ball,
     Box,
     Cylinder,
+    Exact,
     Frictional,
+    Integrated,
     Plane,
     Rectangle,
     Rough,
@@ -114,14 +116,16 @@ def assert_same(got, wanted, rtol=1e-9):
 
 
 # Each row once, each law, and one row in air. Rows of 6, as the programs of single surfaces grow with their number.
+# In the dome a ball could stay, and in the groove between it and a globe: the programs that follow it there take
+# several times as long to compile, and one stands for all.
 CASES = [
-    ("globes", "smooth", None),
-    ("room", "two_coefficients", None),
-    ("boxes", "frictional", None),
-    ("plates", "rough", None),
-    ("posts", "frictional", Air(**AIR)),
+    ("globes", "smooth", None, None),
+    ("room", "two_coefficients", None, Exact()),
+    ("boxes", "frictional", None, Exact()),
+    ("plates", "rough", None, Exact()),
+    ("posts", "frictional", Air(**AIR), Integrated(edges=False)),
 ]
-cases = pytest.mark.parametrize("row, law, air", CASES, ids=[f"{c[0]}_{c[1]}" for c in CASES])
+cases = pytest.mark.parametrize("row, law, air, motion", CASES, ids=[f"{c[0]}_{c[1]}" for c in CASES])
 
 
 def impacts(trajectory):
@@ -131,11 +135,11 @@ def impacts(trajectory):
 
 
 @cases
-def test_a_batch_on_a_stacked_board_moves_as_on_single_surfaces(row, law, air, one_by_one):
+def test_a_batch_on_a_stacked_board_moves_as_on_single_surfaces(row, law, air, motion, one_by_one):
     scene, batch = board(row, LAWS[law], 6, air), throws(32)
 
     def run():
-        return impacts(simulate_batch(scene, batch, t1=0.35, max_impacts=N_ROWS))
+        return impacts(simulate_batch(scene, batch, t1=0.35, max_impacts=N_ROWS, motion=motion))
 
     assert any(isinstance(each, Stack) for each in scene.engine(jnp.float64).surfaces)
     got = run()
@@ -150,17 +154,18 @@ def test_traced_numbers_and_derivatives_are_those_of_the_members_alone_that_are_
     scene = board(row, LAWS[law])
     x, y = ring(ROWS[row][1], 5.0, 0.02)[2]
     state = states([0.02, 0.01, 0.3], [x, y, 1.0], [3.0, -8.0, 5.0])
+    options = {"t1": 0.35, "max_impacts": N_ROWS, "motion": Exact(), "throw": False}
 
     def run(scene):
         def end(scene, state):
-            trajectory = simulate(scene, state, t1=0.35, max_impacts=N_ROWS, throw=False)
+            trajectory = simulate(scene, state, **options)
             return jnp.sum(trajectory.final.position), impacts(trajectory)
 
         traced = jax.tree.map(jnp.asarray, scene)
         return jax.jit(jax.value_and_grad(end, argnums=(0, 1), has_aux=True))(traced, state)
 
     (_, log), (of_scene, of_state) = run(scene)
-    assert_same(log, impacts(simulate(scene, state, t1=0.35, max_impacts=N_ROWS, throw=False)))  # of constants
+    assert_same(log, impacts(simulate(scene, state, **options)))  # of constants
     time, surface, normal, final, n_impacts = log
     struck = sorted(set(np.asarray(surface).tolist()) - {-1})
     assert set(struck) - {0, scene.n_contacts - 1} and len(struck) <= 4
