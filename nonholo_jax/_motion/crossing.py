@@ -157,6 +157,11 @@ def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, wind
         look, least = width / 16.0, float(jnp.finfo(s.dtype).eps) ** 0.75 * arc.length
         m = where((m <= BLIND) & (width <= least), 0.0, m)
     value, rate, m, most, width = shared([value, rate, m, most, width])
+    fails: Any = None
+    if not isinstance(contact, Member) and contact >= system.n_contacts - system.n_derived:
+        # What holds a ball may be gone when an arc begins, and then need not become less.
+        radius: Any = system.reach(contact, here.position)
+        fails = (value < -1e-3 * radius) & ~left_behind
 
     value = where(left_behind, 0.0, jnp.maximum(value, 0.0))
     rate = where(left_behind, jnp.maximum(rate, 0.0), rate)
@@ -173,6 +178,8 @@ def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, wind
         hit = hit & ((rate * rate > -2.0 * m * noise) | (width <= least))
     last = where(closes, jnp.minimum(jnp.minimum(comes, zero), left), 0.0)
     size, clear = where(hit, last, jnp.minimum(zero, width)), zero >= width
+    if fails is not None:
+        size, hit, clear = where(fails, 0.0, size), hit | fails, clear & ~fails
     back = _return(system, contact, arc)
     if may_open:
         # It moves off with neither velocity nor acceleration: at first no bound sees that it is off.

@@ -298,3 +298,37 @@ def test_a_wall_across_a_groove_turns_a_ball_back():
     np.testing.assert_allclose(out.final.position, np.tile([x, R, R], (6, 1)), atol=1e-8)
     np.testing.assert_allclose(out.final.velocity, np.tile([v, 0, 0], (6, 1)), atol=1e-8)
     np.testing.assert_allclose(R * out.final.spin, np.tile([0, v, -v], (6, 1)), atol=1e-8)
+
+
+def test_a_wall_lets_go_at_once_where_nothing_presses_the_ball_to_it_any_more():
+    """It is pushed to the wall by friction alone, against gravity. As soon as it rolls, it leaves, also where the push
+    of the wall is negative then without becoming less."""
+    size, n, t1 = 0.05, 16, 0.5
+
+    @jax.jit
+    @jax.vmap
+    def run(pull, speed):
+        surfaces = {
+            "floor": Plane((0, 0, 0), (0, 0, 1), Frictional(0.3, 0.1, 0.3)),
+            "wall": Plane((0.8, 0, 0), (-1, 0, 0), Frictional(0.0, 0.1, 0.3)),
+        }
+        zero = jnp.zeros_like(pull)
+        velocity, spin = jnp.stack([0.33 + zero, speed, zero]), jnp.stack([-speed, 0.33 + zero, zero]) / size
+        state = BallState(jnp.stack([0.7 + zero, zero, size + zero]), velocity, spin)
+        scene = Scene(Ball(size, 0.05), surfaces, gravity=jnp.stack([pull, -0.6 + zero, -G + zero]))
+        motion = Exact(contact=Integrated(rtol=1e-9, atol=1e-9))
+        return simulate(scene, state, t1=jnp.asarray(t1), motion=motion, throw=False, log_size=8)
+
+    rng = np.random.default_rng(2)
+    pulls, speeds = rng.uniform(-0.5, -0.05, n), rng.uniform(-1.5, -0.5, n)
+    out = run(pulls, speeds)
+    assert np.all(np.asarray(out.result._value) == RESULTS.reached_t1._value)
+    rows = np.asarray(out.impacts.kind._value)
+    last = np.asarray(out.n_impacts) - 1
+    lanes = np.arange(n)
+    assert np.all(rows[lanes, last] == KINDS.left._value) and np.all(rows[lanes, last - 1] == KINDS.gripped._value)
+    times = np.asarray(out.impacts.time)
+    np.testing.assert_allclose(times[lanes, last], times[lanes, last - 1], atol=1e-9)
+    left, rolls = t1 - times[lanes, last], pulls / 1.4
+    np.testing.assert_allclose(out.final.velocity[:, 0], rolls * left, atol=1e-8)
+    np.testing.assert_allclose(out.final.position[:, 0], 0.75 + 0.5 * rolls * left**2, atol=1e-8)
