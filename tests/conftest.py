@@ -18,7 +18,6 @@ gc.set_threshold(100_000, 50, 50)  # programs are made of many objects that stay
 os.environ["NONHOLO_CACHE"] = "off"  # no test writes to the cache of whoever runs it
 
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_include_full_tracebacks_in_locations", False)  # a twentieth of the time of a compilation
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 

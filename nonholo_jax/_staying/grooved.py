@@ -93,8 +93,8 @@ class Grooved(Footing):
         """The directions of the slips on both sides, some time after the arc began."""
         assert below.slides is not None
         found = []
-        known_then = zip(slips, below.slides.headings, below.slides.straight, sides.normals, strict=True)
-        for slip, known, straight, normal in known_then:
+        both = zip(slips, below.slides.headings, below.slides.straight, sides.normals, strict=True)
+        for slip, known, straight, normal in both:
             slides = dot(known, known) > 0
             later = where_vector(straight, rolling.carried(normal, known), rolling.later_heading(slip, known))
             found.append(where_vector(slides, later, rolling.NONE))
