@@ -159,7 +159,7 @@ def _safe_step(system: AbstractSystem, contact: Any, arc: Arc, here: _Here, wind
     value, rate, m, most, width = shared([value, rate, m, most, width])
     fails: Any = None
     if not isinstance(contact, Member) and contact >= system.n_contacts - system.n_derived:
-        # What holds a ball may be gone when an arc begins, and then need not become less.
+        # A push may be negative already when an arc begins, and then it need not become less.
         radius: Any = system.reach(contact, here.position)
         fails = (value < -1e-3 * radius) & ~left_behind
 

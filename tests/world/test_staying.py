@@ -430,10 +430,7 @@ def slip_on_a_crest(friction, later):
     one great circle, with the angle and the speeds of the centre and of the rim."""
     rho, push = 1.0 + R, lambda y: G * np.cos(y[0]) - y[1] ** 2 / (1.0 + R)
     options = {"rtol": 1e-13, "atol": 1e-15, "method": "DOP853"}
-
-    def spare(t, y):
-        return friction * push(y) * (1 + 1 / ALPHA) - G * np.sin(y[0])
-
+    spare = lambda t, y: friction * push(y) * (1 + 1 / ALPHA) - G * np.sin(y[0])  # noqa: E731
     spare.terminal = True
     rolls = lambda t, y: [y[1] / rho, G * np.sin(y[0]) / (1 + ALPHA)]  # noqa: E731
     found = solve_ivp(rolls, (0.0, 2.0), [0.0, np.hypot(0.3, 0.1)], events=spare, **options)
