@@ -3,6 +3,7 @@ Lagrangian system of the paper, whose A says that the contact point does not mov
 
 Picture: the way from above with a spin about the normal and without, and how far the two computations are apart."""
 
+import functools
 import pathlib
 import sys
 from typing import Any
@@ -37,10 +38,12 @@ def normal(x: Any) -> Any:
     return slope / jnp.linalg.norm(slope)
 
 
+@functools.cache  # one scene and one system, so that each is compiled once
 def bowl() -> Scene:
     return Scene(Ball(R, 1.0, ALPHA), {"bowl": Implicit(gap, Rough(0.0))}, gravity=(0.0, 0.0, -G))
 
 
+@functools.cache
 def lagrangian() -> LagrangianSystem:
     """q: place of the centre and a quaternion; v: its velocity and the spin. A v = v - r omega x n = 0, three rows."""
 

@@ -57,6 +57,16 @@ class Settling(Grooved):
         over = (index >= self.scene.n_contacts) & (index < self.end_of_slip)
         return where((over | jnp.any(is_met)) & jnp.any(reached), best, np.int32(-1))
 
+    def _held_by(self, contact: Choice, time: Any, struck: Flight) -> tuple[Any, Any]:
+        """The index of what holds a ball after an impact with that contact: the surface that it hits; or a flush one,
+        where the face that it hits ends beside it. That is then below the ball, to rounding."""
+        face, _ = self.floors.face(contact, struck.position, time)
+        found = neighbours(self.scene, time, face.normal, self.scene.ball.radius, struck)
+        holds, least = found.flush & found.holds, float(jnp.finfo(time.dtype).min)
+        best = jnp.argmax(jnp.where(holds, jnp.maximum(found.ahead, least), -jnp.inf)).astype(jnp.int32)
+        is_held = self.floors.include(contact) & ~face.below & jnp.any(holds)
+        return where(is_held, best, contact.index), is_held
+
     def supports(self, state: Travel) -> tuple[Support, ...]:
         """What the ball stays on, for an impact on something else."""
         floors, found = self.floors, []
@@ -87,19 +97,22 @@ class Settling(Grooved):
         stays: tuple[Any, ...],
     ) -> Touch:
         """`stays` says on which of its supports a ball still is after an impact."""
-        floors, onto = self.floors, None
+        floors, onto, held_by, is_held = self.floors, None, contact.index, False
         state, on = self._kept(contact, time, state, stays)
         if self.joins:  # on a face that is flush with its support it is no less on that
             face, _ = floors.face(self.scene.choice(phase_of(state)), state.flight.position, time)
             onto = self._onto(contact.index, self._flush(time, state, face.normal), time)
             on = on | (onto >= 0)
-        floor, turn = self.scene.choice(where(on, phase_of(state), contact.index)), None
+            if not self.curved:
+                held_by, is_held = self._held_by(contact, time, struck)
+        floor, turn = self.scene.choice(where(on, phase_of(state), held_by)), None
         is_seam = self._is_seam(contact)
         if self.curved:
             x = where_vector(is_seam, self._beyond(time, state.flight), state.flight.position)
             state, struck = state._replace(flight=state.flight._replace(position=x)), struck._replace(position=x)
             pull = self.pull(time, struck, floor)
         face, edged = floors.face(floor, state.flight.position, time)
+        face = face._replace(below=face.below | (is_held & ~on))
         first = train.start(struck.velocity, struck.spin, face.normal, pull, self.scene.ball.radius)
         if self.curved:
             _, turn = floors.turning(floor, struck.position, first.velocity, time)
@@ -201,7 +214,7 @@ class Settling(Grooved):
         if self.follows_hold:
             lifts = (contact.index >= self.end_of_hold) & (contact.index < self.end_of_slips)
             grips = grips | (contact.index >= self.end_of_slips)
-        is_floor = self.floors.include(contact) & touch.face.below & (first.pull > 0)
+        is_floor = self.floors.include(touch.floor) & touch.face.below & (first.pull > 0)
         lasts, clear, sums = self._sums(touch)
         capped = law.rolls & jnp.isfinite(jnp.inf if law.friction is None else law.friction)
         small = rests & ~capped  # whatever it is, it is taken for a train
@@ -325,7 +338,7 @@ class Settling(Grooved):
             velocity=where_vector(settles, end.velocity, velocity),
             spin=where_vector(settles & touch.law.rolls, end.spin, spin),
         )
-        surface, support = touch.contact.index.astype(touch.time.dtype), touch.state.support
+        surface, support = touch.floor.index.astype(touch.time.dtype), touch.state.support
         if self.have_grooves:
             enters, support, after = self.beside(touch, kind, after)
             stays = stays | enters

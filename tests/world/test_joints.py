@@ -206,6 +206,25 @@ def test_landing_beside_a_joint(law, dtype):
     np.testing.assert_allclose(R * halves.final.spin, R * whole.final.spin, rtol=0, atol=bound)
 
 
+@pytest.mark.parametrize("law", [LAWS["rough"], LAWS["frictional"]], ids=["rough", "frictional"])
+def test_bounces_that_die_out_over_a_joint(law):
+    """e02: the last of them hits the edge of the piece that is left; the other piece holds the ball, to rounding."""
+    off, place = np.linspace(-4e-4, 4e-4, 200), np.array([0.0, 0.0, R + 0.02])
+    state = lambda x: BallState(*(jnp.asarray(c, jnp.float32) for c in (x, [0.4, 0.1, 0.0], [0.0, 1.0, 0.3])))  # noqa: E731
+    options = {"t1": jnp.float32(1.0), "max_impacts": 64, "motion": Exact()}
+    whole = simulate(Scene(BALL, pieces(law, 1)), state(place), log_size=8, **options)
+    end = float(whole.at(whole.impacts.until[whole.n_rows - 1]).position[0])  # where they have died out
+
+    places = place + np.c_[1.0 - end + off, 0.0 * off, 0.0 * off]  # the joint is at x = 1
+    state = jax.vmap(state)(jnp.asarray(places))
+    halves = simulate_batch(Scene(BALL, pieces(law, 2)), state, log_size=0, **options)
+    assert set(results_of(halves)) == {"reached_t1"}
+    gone = halves.final.position - state.position
+    np.testing.assert_allclose(gone, np.tile(np.asarray(whole.final.position) - place, (200, 1)), rtol=0, atol=2e-6)
+    np.testing.assert_allclose(halves.final.velocity, np.tile(whole.final.velocity, (200, 1)), rtol=0, atol=2e-6)
+    np.testing.assert_allclose(halves.final.spin, np.tile(whole.final.spin, (200, 1)), rtol=0, atol=2e-5)
+
+
 @laws
 @pytest.mark.parametrize("plastic", [False, True])
 def test_down_a_ramp_onto_the_floor(law, plastic):
