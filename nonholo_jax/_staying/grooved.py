@@ -10,6 +10,7 @@ from .._math import (
     Choice,
     Number,
     Vector3,
+    add,
     cross,
     dot,
     frozen,
@@ -30,6 +31,7 @@ class Entry(NamedTuple):
     """How a ball goes on along the groove of its support and what it meets, or of the two surfaces that it is on."""
 
     joined: Travel
+    sides: groove.Sides
     held: tuple[Any, Any]  # on which sides the ball did not slip before
     path: groove.Way
     course: groove.Course
@@ -58,6 +60,16 @@ class Touch(NamedTuple):
     onto: Any  # the surface onto which it passes, or -1; `None` where no faces are flush
     entry: Entry | None = None  # where there are grooves
     turn: Vector3 | None = None  # how fast the normal of a curved surface turns as the ball goes along
+
+
+def _is_carried(columns: list[Vector3], into: Vector3) -> Any:
+    """Whether pushes that are not negative, times these columns, sum to a vector."""
+    one, two, three = columns
+    volume = dot(cross(one, two), three)
+    parts = [ratio(dot(cross(a, b), c), volume)
+             for a, b, c in ((into, two, three), (one, into, three), (one, two, into))]  # fmt: skip
+    eps = float(jnp.finfo(jnp.result_type(volume)).eps)
+    return (parts[0] >= 0) & (parts[1] >= 0) & (parts[2] >= 0) & (abs(volume) > eps**0.5)
 
 
 class Grooved(Footing):
@@ -141,14 +153,14 @@ class Grooved(Footing):
             change = groove.Change(ends, least, self.first_slip(flight))  # pyright: ignore[reportArgumentType]
             grip = groove.gripped(ball.radius, ball.inertia_ratio, unit, arrays(flight.velocity, time),
                                   arrays(flight.spin, time), pull, self.limits(joined), change)  # fmt: skip
-            return Entry(joined, held, path, grip.course, grip.speed, grip.spin)
+            return Entry(joined, sides, held, path, grip.course, grip.speed, grip.spin)
         speed, pivot = groove.entered(ball.radius, ball.inertia_ratio, path, flight.velocity, flight.spin)
-        along = scale(speed, path.along)
+        along, beside = scale(speed, path.along), sides
         sides = self.sides(time, joined, flight.position, along)
         spin = groove.spin_of(path, speed, pivot, flight.spin, sides.grips[0] | sides.grips[1])
         pull = arrays(pull_at(time, flight._replace(velocity=along, spin=spin)), time)
         course = groove.course(ball.radius, ball.inertia_ratio, sides, along, spin, pull)
-        return Entry(joined, held, path, course, speed, spin)
+        return Entry(joined, beside, held, path, course, speed, spin)
 
     def in_groove(self, touch: Touch, rests: Any) -> tuple[Any, Any, Any, Any]:
         """Whether a ball on one surface goes on along the groove that another one makes with it; whether it could, but
@@ -174,16 +186,35 @@ class Grooved(Footing):
         return follows & pressed, follows & hardly, slips, cornered
 
     def _in_corner(self, touch: Touch, entry: Entry) -> Any:
-        """Whether what is met holds a ball that is in a groove at rest."""
-        time, eps = touch.time, float(jnp.finfo(touch.time.dtype).eps)
-        sides = self.sides(time, entry.joined, touch.state.flight.position, touch.state.flight.velocity)
-        third, (one, two) = arrays(touch.normal, time), sides.normals
-        into = scale(-1.0, self.pull(time, touch.state.flight))
-        volume = dot(cross(one, two), third)
-        parts = [ratio(dot(cross(a, b), c), volume)
-                 for a, b, c in ((into, two, third), (one, into, third), (one, two, into))]  # fmt: skip
-        held = (parts[0] >= 0) & (parts[1] >= 0) & (parts[2] >= 0) & (abs(volume) > eps**0.5)
-        return held & (sides.grips[0] | sides.grips[1]) & (self.scene.air is None)
+        """Whether what is met holds a ball that is in a groove at rest: also now, if friction acts against its spin."""
+        into, normals = scale(-1.0, self.pull(touch.time, touch.state.flight)), self._three_normals(touch, entry)
+        held = _is_carried(normals, into)
+        if self.floors.have_friction:
+            limits, columns = (*self.limits(entry.joined), self._limit(touch.contact)), []
+            for n, limit in zip(normals, limits, strict=True):
+                slip = rolling.own_slip(self.scene.ball.radius, n, rolling.NONE, touch.struck.spin)
+                drag = scale(ratio(where(jnp.isfinite(limit), limit, 0.0), norm(slip)), slip)
+                columns.append(subtract(n, drag))
+            held = held & _is_carried(columns, into)
+        if touch.struck.orientation is not None:
+            held = held & (norm(self._kept_spin(touch, entry)) == 0)
+        return held & (self.scene.air is None)
+
+    def _limit(self, contact: Choice) -> Number:
+        return where(self.floors.rolls(contact), self.floors.friction(contact), 0.0)
+
+    def _three_normals(self, touch: Touch, entry: Entry) -> list[Vector3]:
+        return [*entry.sides.normals, arrays(touch.normal, touch.time)]
+
+    def _kept_spin(self, touch: Touch, entry: Entry) -> Vector3:
+        """The spin of a ball in a corner: friction takes at once all that it acts against, however long that takes."""
+        spin, normals = touch.struck.spin, self._three_normals(touch, entry)
+        grips = [*entry.sides.grips, self.floors.rolls(touch.contact)]
+        axis = rolling.NONE
+        for n, grip in zip(normals, grips, strict=True):
+            axis = add(axis, where_vector(grip, n, rolling.NONE))
+        count = total([where(grip, 1.0, 0.0) for grip in grips])
+        return where_vector(count == 0, spin, where_vector(count == 1, scale(dot(axis, spin), axis), rolling.NONE))
 
     def _rolls_freely(self, joined: Travel) -> Any:
         """Whether nothing resists rolling on a side of a groove, which is not followed."""
@@ -204,7 +235,9 @@ class Grooved(Footing):
         along = where_vector(rests, rolling.NONE, scale(entry.speed, entry.path.along))
         after = after._replace(
             velocity=where_vector(enters | changes, along, after.velocity),
-            spin=where_vector(enters | changes, where_vector(rests, rolling.NONE, entry.spin), after.spin),
+            spin=where_vector(
+                enters | changes, where_vector(rests, self._kept_spin(touch, entry), entry.spin), after.spin
+            ),
         )
         alone = where(index == self.end_of_hold, second, first).astype(dtype)
         return enters | left | changes, where(enters, entry.joined.support, where(left, alone, state.support)), after

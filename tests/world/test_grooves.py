@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 from nonholo_jax import (
     KINDS,
@@ -23,6 +24,7 @@ from nonholo_jax import (
     Plane,
     Rough,
     Scene,
+    Smooth,
     Sphere,
     simulate,
 )
@@ -332,3 +334,29 @@ def test_a_wall_lets_go_at_once_where_nothing_presses_the_ball_to_it_any_more():
     left, rolls = t1 - times[lanes, last], pulls / 1.4
     np.testing.assert_allclose(out.final.velocity[:, 0], rolls * left, atol=1e-8)
     np.testing.assert_allclose(out.final.position[:, 0], 0.75 + 0.5 * rolls * left**2, atol=1e-8)
+
+
+@pytest.mark.parametrize("floor, order", [(Smooth(0.0), (1, 2, 0)), (Rough(0.0), (2, 0, 1))], ids=["smooth", "rough"])
+def test_in_a_corner_a_ball_keeps_the_spin_that_nothing_takes(floor, order):
+    """Between smooth walls: on a smooth floor all of it, on a rough one what is about the normal. Also turned."""
+    turn = Rotation.from_rotvec([0.4, -0.3, 0.8]).as_matrix()
+    points, normals = np.diag([0.4, 0.3, 0.0]), np.array([(-1.0, 0, 0), (0, -1.0, 0), (0, 0, 1.0)])
+
+    @jax.jit
+    @jax.vmap
+    def run(turn, pull):
+        laws = [Smooth(0.0), Smooth(0.0), floor]
+        surfaces = {str(i): Plane(points[i] @ turn.T, normals[i] @ turn.T, laws[i]) for i in order}
+        state = BallState(*(jnp.asarray(x) @ turn.T for x in ([0.0, 0.0, R], [0.6, 0.4, 0.0], [2.0, 3.0, 5.0])))
+        scene = Scene(Ball(R, 0.05), surfaces, gravity=pull @ turn.T)
+        motion = Exact(contact=Integrated(rtol=1e-9, atol=1e-9))
+        return simulate(scene, state, t1=3.0, motion=motion, throw=False, log_size=0)
+
+    turns, pulls = np.stack([np.eye(3), turn, turn]), np.array([[1.0, 1.5, -G], [1.0, 1.5, -G], [2.0, 0.5, -G]])
+    out = run(turns, pulls)
+    assert np.all(np.asarray(out.result._value) == RESULTS.at_rest._value)
+    inward = lambda x: np.einsum("ni,nij->nj", np.asarray(x), turns)  # noqa: E731
+    np.testing.assert_allclose(inward(out.final.position), np.tile([0.4 - R, 0.3 - R, R], (3, 1)), atol=1e-8)
+    np.testing.assert_allclose(out.final.velocity, 0.0, atol=1e-12)
+    kept = [2.0, 3.0, 5.0] if isinstance(floor, Smooth) else [0.0, 0.0, 5.0]
+    np.testing.assert_allclose(inward(out.final.spin), np.tile(kept, (3, 1)), atol=1e-8)
