@@ -3,6 +3,8 @@
 from typing import Any, TypeAlias
 
 import equinox.internal as eqxi
+import jax.core
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 Scalar: TypeAlias = Float[Array, ""]
@@ -16,7 +18,15 @@ Python number is a constant of the program."""
 Index: TypeAlias = Int[Array, ""]
 
 
-class RESULTS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
+class _Names(type(eqxi.Enumeration)):
+    """Equinox cannot print a batch of no items, as the kinds of an empty log are."""
+
+    def __getitem__(cls, item):
+        value = getattr(item, "_value", None)
+        return "[]" if not isinstance(value, jax.core.Tracer) and np.size(value) == 0 else super().__getitem__(item)
+
+
+class RESULTS(eqxi.Enumeration, metaclass=_Names):  # pyright: ignore[reportGeneralTypeIssues]
     """How a motion ended. The first two are successes, the third is a stop, the others are failures."""
 
     reached_t1 = "The motion reached `t1`."
@@ -102,7 +112,7 @@ def result_message(result: RESULTS) -> str:
     return RESULTS._index_to_message[int(result._value)]  # pyright: ignore[reportAttributeAccessIssue]
 
 
-class KINDS(eqxi.Enumeration):  # pyright: ignore[reportGeneralTypeIssues]
+class KINDS(eqxi.Enumeration, metaclass=_Names):  # pyright: ignore[reportGeneralTypeIssues]
     """What one row of an `ImpactLog` stands for."""
 
     unused = "No impact in this row."
