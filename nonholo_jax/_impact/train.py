@@ -13,6 +13,7 @@ slip, geometric too. Trains of one kind only are summed; where impacts of both k
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 
 from .._math import Number, Vector3, add, cross, dot, norm, ratio, scale, shared, subtract, times
 
@@ -184,7 +185,8 @@ def _power(base: Number, count: Number) -> Number:
     size = abs(base)
     known = size > 0
     value = jnp.where(known, jnp.where(known, size, 1.0) ** count, jnp.where(count == 0, 1.0, 0.0))
-    return jnp.where((base < 0) & (count % 2 == 1), -value, value)
+    is_odd = lax.rem(abs(count), jnp.full_like(count, 2.0)) == 1
+    return jnp.where((base < 0) & is_odd, -value, value)
 
 
 def _sum_of_products(a: Number, b: Number, count: Number) -> Number:

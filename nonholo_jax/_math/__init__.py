@@ -41,6 +41,7 @@ from .tiles import (
     in_tiles as in_tiles,
     on_cpu as on_cpu,
     over_devices as over_devices,
+    quotient as quotient,
     unless_batched as unless_batched,
     where_needed as where_needed,
     with_options as with_options,

@@ -19,7 +19,7 @@ from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from .tiles import by_tiles
+from .tiles import by_tiles, quotient
 
 
 class Iteration(NamedTuple):
@@ -206,7 +206,7 @@ def _goes_on(iteration: Iteration, stays: Any) -> Any:
 
 
 def _row(rows: Any, j: Any) -> Any:
-    return jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, j, keepdims=False), rows)
+    return jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, j, keepdims=False, allow_negative_indices=False), rows)
 
 
 def _kept(used: Any, new: Any, old: Any) -> Any:
@@ -251,7 +251,7 @@ def _pulled(iteration: Iteration, hint: Any, arguments: Callable, at: list, cota
     cotangent, cotangents = jax.vjp(iteration.of, moving, jnp.asarray(iteration.table))[1](cotangent)
     parts, sums = iteration.parts(stays, hint), [jnp.zeros_like(x) for x in at]
     slots = min(iteration.most, _SLOTS)
-    stride = jnp.maximum(-(-parts // slots), 1)
+    stride = jnp.maximum(quotient(parts + (slots - 1), slots)[0], 1)
     kept = jax.tree.map(lambda x: jnp.broadcast_to(x, (slots, *jnp.shape(x))), stays)
 
     def job(c: _Pull) -> _Pull:
@@ -275,9 +275,10 @@ def _pulled(iteration: Iteration, hint: Any, arguments: Callable, at: list, cota
         if iteration.most == 1:
             return c._replace(stays=stays, cotangent=cotangent, sums=sums, goal=c.goal - 1)
         on, goal = c.part + 1, jnp.where(here, c.goal - 1, jnp.where(behind, c.goal + 1, c.goal))
-        slot = jnp.where(here | (on % stride != 0), slots, on // stride)
+        slot, beside = quotient(on, stride)
+        slot = jnp.where(here | (beside != 0), slots, slot)
         kept = jax.tree.map(lambda column, x: column.at[slot].set(x, mode="drop"), c.kept, stays)
-        nearest = jnp.clip(goal // stride, 0, slots - 1)
+        nearest = jnp.minimum(quotient(jnp.maximum(goal, 0), stride)[0], slots - 1)
         finished = c.finished | (here & (c.goal == c.last) & iteration.finished(stays))
         stays = _kept(here, _row(kept, nearest), stays)
         return _Pull(

@@ -112,6 +112,12 @@ def along(flags: Any, x: Any) -> Any:
     return flags.reshape(flags.shape + (1,) * (x.ndim - flags.ndim))
 
 
+def quotient(n: Any, size: Any) -> tuple[Any, Any]:
+    """Quotient and remainder of integers of which neither is negative, so that no sign has to be looked at."""
+    size = jnp.asarray(size, n.dtype)
+    return lax.div(n, size), lax.rem(n, size)
+
+
 def _gathered(whole: Callable, needed: Any, otherwise: Any, lanes: Any, n: int, size: int) -> Any:
     """Those of the lanes that need it, `size` at a time; a gap in the last group is filled with some lane."""
     some = lambda: jnp.cumsum(needed, dtype=jnp.int32)  # noqa: E731
@@ -122,7 +128,7 @@ def _gathered(whole: Callable, needed: Any, otherwise: Any, lanes: Any, n: int, 
         found = whole(*jax.tree.map(lambda x: x.at[index].get(mode="clip"), (out, lanes)))
         return jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), out, found)
 
-    return lax.fori_loop(0, -(-count[-1] // size), group, otherwise)
+    return lax.fori_loop(0, quotient(count[-1] + (size - 1), size)[0], group, otherwise)
 
 
 def by_tiles(whole: Callable, lanes: Any, n: int, size: int) -> Any:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._math import KINDS, RESULTS, frozen, norm, on_cpu, shared, total, where
+from .._math import KINDS, RESULTS, frozen, norm, on_cpu, quotient, shared, total, where
 from .._world import AbstractSystem, Meeting
 from .crossing import crossing_time, search
 from .motion import AbstractMotion
@@ -248,7 +248,7 @@ def _followed(c: Carry, ended: Any, sizes: tuple, contact: Any, kind: Any, flags
         return c.path
     begun = Begun(c.time, c.state, c.memory, c.since)
     row = _path_row(contact, kind, flags, c.n_impacts, jnp.stack(sizes), begun)
-    return _written(c.path, c.n_arcs % c.path.labels.shape[0], ended, *row)
+    return _written(c.path, quotient(c.n_arcs, c.path.labels.shape[0])[1], ended, *row)
 
 
 def turn(

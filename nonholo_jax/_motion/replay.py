@@ -21,6 +21,7 @@ from .._math import (
     Iteration,
     frozen,
     in_tiles,
+    quotient,
     shared,
     tangent_of,
     unless_batched,
@@ -152,7 +153,7 @@ def _iteration(max_impacts: int, log_rows: int, pieces: int, values: Any, in_bat
         _, done, found = stays
         # Rounding may find another arc or two than were found without derivatives.
         left = jnp.where(found.done, 0, jnp.maximum(n_arcs - done, 0) + 2)
-        return jnp.minimum(-(-eqxi.unvmap_max(left) // rows), most)
+        return jnp.minimum(quotient(eqxi.unvmap_max(left) + (rows - 1), rows)[0], most)
 
     def look(arguments: Any, i: Any, stays: Any) -> tuple:
         moves, done, found = stays

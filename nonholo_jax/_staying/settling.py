@@ -112,7 +112,8 @@ class Settling(Grooved):
             state, struck = state._replace(flight=state.flight._replace(position=x)), struck._replace(position=x)
             pull = self.pull(time, struck, floor)
         face, edged = floors.face(floor, state.flight.position, time)
-        face = face._replace(below=face.below | (is_held & ~on))
+        if is_held is not False:
+            face = face._replace(below=face.below | (is_held & ~on))
         first = train.start(struck.velocity, struck.spin, face.normal, pull, self.scene.ball.radius)
         if self.curved:
             _, turn = floors.turning(floor, struck.position, first.velocity, time)
@@ -214,7 +215,8 @@ class Settling(Grooved):
         if self.follows_hold:
             lifts = (contact.index >= self.end_of_hold) & (contact.index < self.end_of_slips)
             grips = grips | (contact.index >= self.end_of_slips)
-        is_floor = self.floors.include(touch.floor) & touch.face.below & (first.pull > 0)
+        lands = touch.floor if self.joins else contact
+        is_floor = self.floors.include(lands) & touch.face.below & (first.pull > 0)
         lasts, clear, sums = self._sums(touch)
         capped = law.rolls & jnp.isfinite(jnp.inf if law.friction is None else law.friction)
         small = rests & ~capped  # whatever it is, it is taken for a train
@@ -338,7 +340,8 @@ class Settling(Grooved):
             velocity=where_vector(settles, end.velocity, velocity),
             spin=where_vector(settles & touch.law.rolls, end.spin, spin),
         )
-        surface, support = touch.floor.index.astype(touch.time.dtype), touch.state.support
+        surface, support = (touch.floor if self.joins else touch.contact).index, touch.state.support
+        surface = surface.astype(touch.time.dtype)
         if self.have_grooves:
             enters, support, after = self.beside(touch, kind, after)
             stays = stays | enters
