@@ -155,12 +155,12 @@ class Grooved(Footing):
                                   arrays(flight.spin, time), pull, self.limits(joined), change)  # fmt: skip
             return Entry(joined, sides, held, path, grip.course, grip.speed, grip.spin)
         speed, pivot = groove.entered(ball.radius, ball.inertia_ratio, path, flight.velocity, flight.spin)
-        along, beside = scale(speed, path.along), sides
+        along = scale(speed, path.along)
         sides = self.sides(time, joined, flight.position, along)
         spin = groove.spin_of(path, speed, pivot, flight.spin, sides.grips[0] | sides.grips[1])
         pull = arrays(pull_at(time, flight._replace(velocity=along, spin=spin)), time)
         course = groove.course(ball.radius, ball.inertia_ratio, sides, along, spin, pull)
-        return Entry(joined, beside, held, path, course, speed, spin)
+        return Entry(joined, sides, held, path, course, speed, spin)
 
     def in_groove(self, touch: Touch, rests: Any) -> tuple[Any, Any, Any, Any]:
         """Whether a ball on one surface goes on along the groove that another one makes with it; whether it could, but
@@ -190,7 +190,7 @@ class Grooved(Footing):
         into, normals = scale(-1.0, self.pull(touch.time, touch.state.flight)), self._three_normals(touch, entry)
         held = _is_carried(normals, into)
         if self.floors.have_friction:
-            limits, columns = (*self.limits(entry.joined), self._limit(touch.contact)), []
+            limits, columns = (*self.limits(entry.joined), self.limit(touch.contact)), []
             for n, limit in zip(normals, limits, strict=True):
                 slip = rolling.own_slip(self.scene.ball.radius, n, rolling.NONE, touch.struck.spin)
                 drag = scale(ratio(where(jnp.isfinite(limit), limit, 0.0), norm(slip)), slip)
@@ -200,15 +200,17 @@ class Grooved(Footing):
             held = held & (norm(self._kept_spin(touch, entry)) == 0)
         return held & (self.scene.air is None)
 
-    def _limit(self, contact: Choice) -> Number:
-        return where(self.floors.rolls(contact), self.floors.friction(contact), 0.0)
-
     def _three_normals(self, touch: Touch, entry: Entry) -> list[Vector3]:
         return [*entry.sides.normals, arrays(touch.normal, touch.time)]
 
     def _kept_spin(self, touch: Touch, entry: Entry) -> Vector3:
         """The spin of a ball in a corner: friction takes at once all that it acts against, however long that takes."""
         spin, normals = touch.struck.spin, self._three_normals(touch, entry)
+        if self.floors.resist[1]:
+            beside = (phase_of(touch.state), second_of(touch.state))
+            three = [*(self.scene.choice(index) for index in beside), touch.contact]
+            takes = total([self.floors.resistance(each, 1) for each in three]) > 0
+            spin = where_vector(takes, rolling.NONE, spin)
         grips = [*entry.sides.grips, self.floors.rolls(touch.contact)]
         axis = rolling.NONE
         for n, grip in zip(normals, grips, strict=True):

@@ -204,12 +204,11 @@ class Footing:
     def limits(self, state: Travel) -> tuple[Number, Number]:
         """The coefficients of friction on both sides of a groove: infinite where a ball cannot slip, zero where nothing
         holds it."""
-        one, two = (self.scene.choice(i) for i in (phase_of(state), second_of(state)))
-        floors = self.floors
-        return (
-            where(floors.rolls(one), floors.friction(one), 0.0),
-            where(floors.rolls(two), floors.friction(two), 0.0),
-        )
+        one, two = (self.limit(self.scene.choice(i)) for i in (phase_of(state), second_of(state)))
+        return one, two
+
+    def limit(self, side: Choice) -> Number:
+        return where(self.floors.rolls(side), self.floors.friction(side), 0.0)
 
     def ground(self, time: Any, state: Travel) -> Ground:
         flight, floors, on = state.flight, self.floors, state.support >= 0

@@ -45,6 +45,12 @@ from .grooved import Grooved, Touch
 from .ground import Travel, phase_of, second_of, support_of
 
 
+def _foremost(found: Neighbours, which: Any) -> Any:
+    """The index of the surface among those that lies most ahead."""
+    least = float(jnp.finfo(found.ahead.dtype).min)
+    return jnp.argmax(jnp.where(which, jnp.maximum(found.ahead, least), -jnp.inf)).astype(jnp.int32)
+
+
 class Settling(Grooved):
     """What a ball does that comes to a surface to stay on, or meets something there."""
 
@@ -52,8 +58,8 @@ class Settling(Grooved):
         """The surface onto which a ball passes that comes to the contact of that index, an edge of its support or a
         flush face; or -1."""
         is_met = found.flush & (numbers_of(self.scene) == index)
-        reached, least = found.flush & found.holds | is_met, float(jnp.finfo(time.dtype).min)
-        best = jnp.argmax(jnp.where(reached, jnp.maximum(found.ahead, least), -jnp.inf)).astype(jnp.int32)
+        reached = found.flush & found.holds | is_met
+        best = _foremost(found, reached)
         over = (index >= self.scene.n_contacts) & (index < self.end_of_slip)
         return where((over | jnp.any(is_met)) & jnp.any(reached), best, np.int32(-1))
 
@@ -62,10 +68,9 @@ class Settling(Grooved):
         where the face that it hits ends beside it. That is then below the ball, to rounding."""
         face, _ = self.floors.face(contact, struck.position, time)
         found = neighbours(self.scene, time, face.normal, self.scene.ball.radius, struck)
-        holds, least = found.flush & found.holds, float(jnp.finfo(time.dtype).min)
-        best = jnp.argmax(jnp.where(holds, jnp.maximum(found.ahead, least), -jnp.inf)).astype(jnp.int32)
+        holds = found.flush & found.holds
         is_held = self.floors.include(contact) & ~face.below & jnp.any(holds)
-        return where(is_held, best, contact.index), is_held
+        return where(is_held, _foremost(found, holds), contact.index), is_held
 
     def supports(self, state: Travel) -> tuple[Support, ...]:
         """What the ball stays on, for an impact on something else."""
