@@ -208,6 +208,7 @@ class Footing:
         return one, two
 
     def limit(self, side: Choice) -> Number:
+        """The coefficient of friction on one side."""
         return where(self.floors.rolls(side), self.floors.friction(side), 0.0)
 
     def ground(self, time: Any, state: Travel) -> Ground:
