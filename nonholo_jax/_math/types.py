@@ -22,7 +22,7 @@ class _Names(type(eqxi.Enumeration)):
     """Equinox cannot print a batch of no items, as the kinds of an empty log are."""
 
     def __getitem__(cls, item):
-        value = getattr(item, "_value", None)
+        value = getattr(item, "_value", 0)
         return "[]" if not isinstance(value, jax.core.Tracer) and np.size(value) == 0 else super().__getitem__(item)
 
 
