@@ -135,8 +135,9 @@ def _row(numbers: tuple, dtype: Any) -> Any:
 
 def _held(friction: Any, lighter: Any, heavier: Any, needed: Any) -> Any:
     """How far friction goes towards holding a ball on a support: its pressure there goes from `lighter`, without
-    friction, to `heavier`, where it is enough for what is `needed`. All the way where friction is infinite."""
-    coefficient = jnp.where(jnp.isinf(friction), 0.0, friction)
+    friction, to `heavier`, where it is enough for what is `needed`. All the way where friction is infinite; not at all
+    where it is not enough and the ball would be pulled in, which is no pressure."""
+    coefficient, lighter = jnp.where(jnp.isinf(friction), 0.0, friction), jnp.maximum(lighter, 0.0)
     slips = needed > coefficient * heavier
     rest = needed - coefficient * (heavier - lighter)
     part = jnp.where(slips, coefficient * lighter / jnp.where(slips, rest, 1.0), 1.0)

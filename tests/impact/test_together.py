@@ -299,6 +299,25 @@ def test_a_cushion_presses_the_ball_on_the_table(friction):
     assert float(turned[1]) * R >= -0.9 - 1e-12
 
 
+def test_no_friction_where_the_ball_is_lifted():
+    """A ball that rolls and spins meets a rough post that lifts it off its support, which holds it all the same, but
+    gives no friction against that. In one of 100,352 random motions in a bowl with a post it gave fifty times what it
+    could, the other way, and the ball flew off with nine times its energy."""
+    rng, n, laws = np.random.default_rng(3), 4000, [Frictional(0.2, 0.1, 0.9), Frictional(0.2, 0.1, 0.8)]
+
+    @jax.jit
+    @jax.vmap
+    def run(normals, v, spin, friction):
+        parts, _ = takes_part(touched_by(laws, normals, 0), v)
+        return impact(laws, normals, v, spin, 0, friction, counts=parts)
+
+    normals, v, spin = throws_at(rng, 2, 0, n)
+    spin = spin + rng.normal(size=(n, 1)) * 20.0 / R * normals[:, 0]
+    after, turned = (np.asarray(x) for x in run(*map(jnp.asarray, (normals, v, spin, rng.uniform(0.0, 1.0, n)))))
+    size = lambda v, spin: np.sum(v**2, axis=1) + ALPHA * R * R * np.sum(spin**2, axis=1)  # noqa: E731
+    assert np.all(size(after, turned) <= size(v, spin) * (1 + 1e-12))
+
+
 def in_groove(rng, count=20):
     """Normals of two sides and of what a ball meets there that rolls along, held or not by the second side."""
     for i in range(count):
