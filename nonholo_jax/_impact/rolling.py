@@ -81,16 +81,40 @@ def is_straight(known: Vector3, along: Vector3, pull: Number) -> Any:
     return (dot(known, known) == 0) | (_sideways(known, along) <= 64.0 * eps * abs(pull))
 
 
-def stays_straight(
-    known: Vector3, slip: Vector3, along: Vector3, most: Number, tolerance: float, least: Number = 0.0
+def decay(known: Vector3, along: Vector3, most: Number) -> Number:
+    """The rate at which a slip of the direction `known` dies out, on average until its end, while g_t and F are
+    constant. F|u| + g_t . u then changes at the rate g_t^2 - F^2, however the slip turns, so that it lasts
+    (F|u| + g_t . u) / (F^2 - g_t^2)."""
+    return ratio(most * most - dot(along, along), plus(most, dot(known, along)))
+
+
+def lasts(known: Vector3, slip: Vector3, along: Vector3, most: Number) -> Number:
+    """How long a slip lasts at that rate; infinite where there is none, or friction does not end it."""
+    speed = norm(slip)
+    ends = (speed > 0) & (most > norm(along))
+    return where(ends, ratio(speed, decay(known, along, most), otherwise=jnp.inf), jnp.inf)
+
+
+def ends_soon(
+    known: Vector3,
+    slip: Vector3,
+    along: Vector3,
+    most: Number,
+    tolerance: float,
+    change: Number = 0.0,
+    least: Number = 0.0,
 ) -> Any:
-    """Whether the end of the slip is so near that its direction may be kept, for a velocity of 100 `tolerance` and a
-    way of `tolerance` (m/s and m). The direction settles at the rate |g_t| / |u|, which is faster than any explicit
-    solver can follow: where friction hardly exceeds gravity, it would not come to the end without this. A slip that
-    decays at the rate `least` or less may as well be one that has just begun."""
-    decay, speed = most - dot(known, along), norm(slip)
-    aside = ratio(speed * _sideways(known, along), norm(along))
-    return (decay > least) & (aside <= 100.0 * tolerance) & (aside * speed <= tolerance * decay)
+    """Whether a slip is so near its end that it may go straight there, at the rate `decay`: friction and gravity change
+    the velocity until then as they do along the true path, which a straight one misses by no more than `tolerance` (m).
+    `change` is the part of both that may change in a second: that must be less than 10 `tolerance` (m/s). The direction
+    of a slip settles at the rate |g_t| / |u|, which is faster than any explicit solver can follow: where friction
+    hardly exceeds gravity, it would not come to the end without this. A slip that decays at the rate `least` or less
+    may as well be one that has just begun."""
+    speed, drive, left = norm(slip), norm(along), lasts(known, slip, along, most)
+    aside = ratio(speed * _sideways(known, along), drive)
+    left = where(jnp.isfinite(left), left, 0.0)
+    near = (aside * left <= tolerance) & (left * left * change * (most + drive) <= 10.0 * tolerance)
+    return (speed > least * left) & (most > drive) & near
 
 
 def _sideways(known: Vector3, along: Vector3) -> Number:

@@ -30,7 +30,7 @@ from .polynomial import (
     square as square,
 )
 from .rotation import matrix as matrix, rolled as rolled, turned as turned
-from .shared import shared as shared
+from .shared import if_any as if_any, shared as shared
 from .tangents import Iteration as Iteration, tangent_of as tangent_of
 from .tiles import (
     LEAST_EFFORT as LEAST_EFFORT,
@@ -38,6 +38,7 @@ from .tiles import (
     along as along,
     by_tiles as by_tiles,
     free_devices as free_devices,
+    in_a_queue as in_a_queue,
     in_tiles as in_tiles,
     on_cpu as on_cpu,
     over_devices as over_devices,

@@ -1,4 +1,4 @@
-"""Numbers that are computed once.
+"""Numbers that are computed once, or not at all.
 
 XLA's fusion on the CPU copies whatever is cheap into all of its consumers, and these into theirs, so that a chain of
 stages is computed anew for every output, and compiled anew. From JAX 0.12 on, `lax.optimization_barrier` prevents
@@ -7,9 +7,10 @@ multiplication in derivatives, where its divisor has fewer axes. Hence a primiti
 becomes a barrier or a division only when the program is lowered.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -39,3 +40,8 @@ mlir.register_lowering(_shared, mlir.lower_fun(_opaque, multiple_results=False),
 def shared(values: Sequence[Any]) -> tuple:
     """The same floating-point numbers, computed once in the compiled program, and their derivatives likewise."""
     return tuple(value if is_constant(value) else _shared.bind(jnp.asarray(value)) for value in values)
+
+
+def if_any(condition: Any, wanted: Callable, plain: Callable) -> Any:
+    """`wanted()` if a condition holds in any lane of a batch: otherwise `plain()`, which must be equal then."""
+    return lax.cond(eqxi.unvmap_any(condition), wanted, plain)

@@ -18,6 +18,7 @@ from jax.sharding import Mesh, PartitionSpec
 # Options for `jit` on a CPU. XLA takes no pains over a program that will not run for long, and uses the widest vectors
 # that the processor has, not half of them. An inner `jit` may have none.
 LEAST_EFFORT: Any = {"compiler_options": {"xla_backend_optimization_level": 0}}
+_LONGEST_LINE = 64  # tiles
 WIDEST_VECTORS: Any = {"compiler_options": {"xla_cpu_prefer_vector_width": 512}}
 
 
@@ -47,16 +48,33 @@ def with_options(function: Callable, options: dict) -> Callable:
 def in_tiles(function: Callable, size: int, alone: Callable | None = None) -> Callable:
     """The same function of pytrees, which under `vmap` on a CPU runs `size` lanes at a time; `alone` is another way to
     compute it for one lane. Not differentiable in reverse mode."""
-    return _in_a_batch(lambda whole, lanes, n: by_tiles(whole, lanes, n, size), alone or function, function)
+    return _in_a_batch(lambda whole, lanes, n: by_tiles(whole(function), lanes, n, size), alone or function)
+
+
+def in_a_queue(begin: Callable, advance: Callable, finished: Callable, size: int, alone: Callable) -> Callable:
+    """A function of pytrees, `advance(c, *args)` from `c = begin(*args)` on until `finished(c)`. Under `vmap` on a CPU
+    it runs `size` lanes at a time, and where an eighth of them has finished, the next in line take their place: none
+    waits for a slow one. `alone` computes it for one lane. Not differentiable in reverse mode."""
+
+    def run_all(whole: Callable, lanes: Any, n: int) -> Any:
+        first, turn = whole(begin), whole(advance)
+        if n <= size or not on_cpu():
+            return lax.while_loop(lambda c: ~jnp.all(finished(c)), lambda c: turn(lanes, c), first(lanes))
+        part = -(-n // -(-n // (_LONGEST_LINE * size)))  # a line is kept in memory as a whole
+        queue = lambda lanes: _queued(first, turn, finished, lanes, part, size)  # noqa: E731
+        return by_tiles(queue, lanes, n, part)
+
+    return _in_a_batch(run_all, alone)
 
 
 def unless_batched(alone: Callable, function: Callable) -> Callable:
     """`alone` for one lane, and under `vmap` another way to compute the same. Not differentiable in reverse mode."""
-    return _in_a_batch(lambda whole, lanes, n: whole(lanes), alone, function)
+    return _in_a_batch(lambda whole, lanes, n: whole(function)(lanes), alone)
 
 
-def _in_a_batch(run_all: Callable, alone: Callable, function: Callable) -> Callable:
-    """`run_all(whole, lanes, n)` computes `whole`, which is `function` for many, where it is batched."""
+def _in_a_batch(run_all: Callable, alone: Callable) -> Callable:
+    """`alone`, but `run_all(whole, lanes, n)` where it is batched; `whole(f)` is f for many: a function of `lanes` and
+    of what f takes before its arguments."""
 
     def call(*args):
         arrays, constants = eqx.partition(args, eqx.is_array)
@@ -69,7 +87,10 @@ def _in_a_batch(run_all: Callable, alone: Callable, function: Callable) -> Calla
         def over_lanes(axis_size, in_batched, arrays):
             (batched,) = in_batched
             lanes, rest = eqx.partition(arrays, batched)
-            whole = jax.vmap(lambda lanes: function(*eqx.combine(lanes, rest, constants)))
+
+            def whole(function):
+                return jax.vmap(lambda lanes, *more: function(*more, *eqx.combine(lanes, rest, constants)))
+
             out = run_all(whole, lanes, axis_size)
             return out, jax.tree.map(lambda _: True, out)
 
@@ -129,6 +150,31 @@ def _gathered(whole: Callable, needed: Any, otherwise: Any, lanes: Any, n: int, 
         return jax.tree.map(lambda x, new: x.at[index].set(new, mode="drop"), out, found)
 
     return lax.fori_loop(0, quotient(count[-1] + (size - 1), size)[0], group, otherwise)
+
+
+def _queued(first: Callable, turn: Callable, finished: Callable, lanes: Any, n: int, size: int) -> Any:
+    """`n` lanes, a tile of `size` at a time, in which those that have finished are replaced."""
+    few = max(size // 8, 1)
+    of = lambda tree, index: jax.tree.map(lambda x: x.at[index].get(mode="clip"), tree)  # noqa: E731
+
+    def refilled(state: tuple) -> tuple:
+        line, index, following = state
+        own, c = of(lanes, index), of(line, index)
+        busy = lambda c: ~jnp.all(finished(c)) & ((following >= np.int32(n)) | (jnp.sum(finished(c)) < few))  # noqa: E731
+        c = lax.while_loop(busy, lambda c: turn(own, c), c)
+        line = jax.tree.map(lambda x, new: x.at[index].set(new, unique_indices=True), line, c)
+        free = finished(c)
+        new = following - 1 + jnp.cumsum(free, dtype=jnp.int32)
+        fresh = free & (new < np.int32(n))
+        return line, jnp.where(fresh, new, index), following + jnp.sum(fresh, dtype=jnp.int32)
+
+    def going(state: tuple) -> Any:
+        line, index, following = state
+        return (following < np.int32(n)) | ~jnp.all(of(finished(line), index))
+
+    line = by_tiles(first, lanes, n, size)
+    start = line, jnp.arange(size, dtype=jnp.int32), jnp.asarray(size, jnp.int32)
+    return lax.while_loop(going, refilled, start)[0]
 
 
 def by_tiles(whole: Callable, lanes: Any, n: int, size: int) -> Any:

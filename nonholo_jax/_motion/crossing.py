@@ -27,6 +27,7 @@ from .._math import (
     derivative,
     evaluate,
     frozen,
+    if_any,
     norm,
     recentred,
     shared,
@@ -49,9 +50,14 @@ class Arc(eqx.Module):
     length: Number
     unit: Number
     is_parabola: Any = None  # where only the program that runs knows whether it is one
+    derived: tuple[Polynomial, ...] = ()  # what some gaps see beside the configuration
 
     def position(self, s: Number) -> tuple:
         return tuple(evaluate(p, s) for p in self.configuration)
+
+    def seen(self, s: Number) -> tuple:
+        """What gaps see: the configuration, and what is derived."""
+        return self.position(s) + tuple(evaluate(p, s) for p in self.derived)
 
     def tangent(self, s: Number) -> tuple:
         """The derivative of `position`, per unit of local time."""
@@ -104,9 +110,9 @@ class _Here(NamedTuple):
         return tuple(p[2] if len(p) > 2 else 0.0 for p in self.coefficients)
 
 
-def _here(arc: Arc, s: Any) -> _Here:
-    coefficients = tuple(recentred(p, s) for p in arc.configuration)
-    size = total([evaluate(tuple(abs(c) for c in p), s) for p in arc.configuration])
+def _here(path: Sequence[Polynomial], s: Any) -> _Here:
+    coefficients = tuple(recentred(p, s) for p in path)
+    size = total([evaluate(tuple(abs(c) for c in p), s) for p in path])
     return _Here(s, coefficients, size, norm(tuple(p[1] for p in coefficients)))
 
 
@@ -214,6 +220,17 @@ def _nearest(contacts: Any, step: Callable) -> tuple[_Step, Any]:
     return jax.tree.map(lambda x: x[nearest], steps), start + nearest
 
 
+def _nearest_of(contacts: Sequence, step: Callable, nearest: tuple[_Step, Any]) -> tuple[_Step, Any]:
+    """The shortest of the steps towards these contacts and of one that is known."""
+    first, contact = nearest
+    for each in contacts:
+        found, number = _nearest(each, step)
+        closer = found.size < first.size  # a tie goes to the first
+        contact = where(closer, number, contact)
+        first = _Step(*[_either(closer, a, b) for a, b in zip(found, first, strict=True)])
+    return first, contact
+
+
 def _either(condition: Any, a: Any, b: Any) -> Any:
     """`where`; `None` is nothing."""
     if a is None and b is None:
@@ -243,14 +260,22 @@ def search(system: AbstractSystem, arc: Arc, start: Any, window: Any, touching: 
 
     def step(state: Search) -> Search:
         s, none = state.s, jnp.asarray(-1, dtype=jnp.int32)
-        here = _here(arc, s)
-        first, contact = _Step(jnp.asarray(jnp.inf, s.dtype), False, True, *_NOTHING), none
-        step_towards = lambda contact: _safe_step(system, contact, arc, here, state.window, touching)  # noqa: E731
-        for contacts in system.contacts():
-            each, number = _nearest(contacts, step_towards)
-            closer = each.size < first.size  # a tie goes to the first
-            contact = where(closer, number, contact)
-            first = _Step(*[_either(closer, a, b) for a, b in zip(each, first, strict=True)])
+        look = (state.window, touching)
+        here = _here(arc.configuration, s)
+        contacts = system.contacts()
+        n = len(contacts) - system.n_derived
+        nearest = _Step(jnp.asarray(jnp.inf, s.dtype), False, True, *_NOTHING), none
+        nearest = _nearest_of(contacts[:n], lambda each: _safe_step(system, each, arc, here, *look), nearest)
+        if system.n_derived > 0:  # a ball that flies has no contact to lose
+            typed = lambda x: jnp.asarray(x, s.dtype if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else None)  # noqa: E731
+
+            def more() -> tuple:
+                here = _here((*arc.configuration, *arc.derived), s)
+                found = _nearest_of(contacts[n:], lambda each: _safe_step(system, each, arc, here, *look), nearest)
+                return jax.tree.map(typed, found)
+
+            nearest = if_any(system.phase(arc.start) >= 0, more, lambda: jax.tree.map(typed, nearest))
+        first, contact = nearest
         end = s + first.size
         hit = first.hit & (end <= arc.length)
         ahead = where(first.clear, 4.0, 2.0) * jnp.minimum(first.size, arc.length)
@@ -303,7 +328,7 @@ def _crossing_time_jvp(primals: tuple, tangents: tuple) -> tuple:
     contact = system.choice(index)
 
     def level(system: AbstractSystem, arc: Arc, s: Any) -> Any:
-        q, contact = arc.position(s), system.choice(index)  # its surfaces are those of this system
+        q, contact = arc.seen(s), system.choice(index)  # its surfaces are those of this system
         levels = [system.level(each, arc.time, q, arc.start) for each in contact.members]
         return contact.of([jnp.asarray(level, s.dtype) for level in levels])
 

@@ -11,8 +11,9 @@ import jax.core
 import jax.numpy as jnp
 import lazy_loader
 import numpy as np
+from jax import lax
 
-from .._math import Scalar, frozen, plus, root, shared, times, total
+from .._math import Scalar, frozen, if_any, plus, root, shared, times, total
 from .crossing import Arc
 from .motion import AbstractMotion, Piece, check_counts
 
@@ -222,14 +223,20 @@ def _stages_in_turn(tableau: Any, system: Any, time: Any, state: Any, h: Any) ->
 
     def stage(slopes, each):
         index, row, c = each
-        z = [x + h * jnp.sum(row[:, None] * slope, axis=0) for x, slope in zip((q, v), slopes, strict=True)]
+        z = [x + h * _product(row, slope) for x, slope in zip((q, v), slopes, strict=True)]
         rates = system.derivative(time + c * h, state, *(tuple(x) for x in z))
-        return tuple(x.at[index].set(_joined(rate, time)) for x, rate in zip(slopes, rates, strict=True)), None
+        new = zip(slopes, rates, strict=True)
+        return tuple(lax.dynamic_update_index_in_dim(x, _joined(rate, time), index, 0) for x, rate in new), None
 
     plan = (jnp.arange(count), jnp.asarray(weights, dtype=time.dtype), jnp.asarray(nodes, dtype=time.dtype))
     start = tuple(jnp.zeros((count, x.size), time.dtype) for x in (q, v))
     (rates, others), _ = jax.lax.scan(stage, start, plan)
     return [(h * rates[i], h * others[i]) for i in range(count)], [(rates[i],) for i in range(count)]
+
+
+def _product(a: Any, b: Any) -> Any:
+    """Of matrices, without loss of accuracy on any device."""
+    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
 def _joined(x: Any, like: Any) -> Any:
@@ -341,11 +348,12 @@ def _with_derived(system: Any, arc: Arc) -> Arc:
         found = system.derived(arc.time + s * arc.unit, arc.start, arc.position(s), arc.velocity(s))
         return tuple(jnp.asarray(x, s.dtype) for x in found)
 
-    values = jax.vmap(sample)(jnp.asarray(nodes, arc.length.dtype))  # pyright: ignore
+    at = jnp.asarray(nodes, arc.length.dtype)  # pyright: ignore
+    none = lambda: (jnp.ones_like(at),) * system.n_derived  # noqa: E731
+    values = if_any(system.phase(arc.start) >= 0, lambda: jax.vmap(sample)(at), none)
     weights = jnp.asarray(inverse, arc.length.dtype)  # pyright: ignore
-    fitted = [jnp.sum(weights * x[None], axis=1) for x in values]
-    configuration = (*arc.configuration, *[tuple(x[i] for i in range(degree + 1)) for x in fitted])
-    return dataclasses.replace(arc, configuration=configuration)
+    fitted = [_product(weights, x) for x in values]
+    return dataclasses.replace(arc, derived=tuple(tuple(x[i] for i in range(degree + 1)) for x in fitted))
 
 
 def _fitted_arc(path: Any, z0: Any, time: Any, state: Any, h: Any) -> Arc:

@@ -14,13 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .._math import KINDS, RESULTS, frozen, norm, on_cpu, quotient, shared, total, where
+from .._math import KINDS, RESULTS, frozen, if_any, norm, on_cpu, quotient, shared, total, where
 from .._world import AbstractSystem, Meeting
 from .crossing import crossing_time, search
 from .motion import AbstractMotion
 
 _MOST_IMPACTS_AT_ONCE = 128
 _FEW_ROWS = 64
+_LONG = 8  # steps of the search in one turn, where it is the arc that takes the time
 
 
 class Row(NamedTuple):
@@ -257,14 +258,14 @@ def turn(
     """One turn: search one arc a little further; where that ends it, finish it. `differentiable` turns have derivatives
     of their own."""
     active, left, stays = ~c.done, t1 - c.time + c.ahead, system.phase(c.state) >= 0
-    size = where(active, motion.size(c.control, left, stays), 1.0)  # finished lanes compute harmless numbers
+    ready = system.prepared(c.time, c.state)
+    size = where(active, _size(system, motion, c.control, ready, left, stays), 1.0)  # else harmless numbers
     last = size >= left
     length = where(last, left, frozen(size))
-    ready = system.prepared(c.time, c.state)
     piece = motion.piece(system, c.time, ready, c.memory, c.jumped, length)
     arc = piece.arc
     kept, control = motion.judge(c.control, size, piece.trial, stays)
-    found = search(system, arc, c.s, c.window, c.touching, motion.safe_steps)
+    found = search(system, arc, c.s, c.window, c.touching, max(motion.safe_steps, _LONG * system.is_long))
     kept, control = _ending_there(system, motion, arc, found, kept, stays, control)
     kept, finished = _shared_flags((kept, found.finished))
     ended = active & kept & finished
@@ -333,6 +334,12 @@ def turn(
     )
 
 
+def _size(system: AbstractSystem, motion: AbstractMotion, control: Any, ready: Any, left: Any, stays: Any) -> Any:
+    """The size in seconds of the next arc."""
+    size, most = motion.size(control, left, stays), system.longest(ready)
+    return size if most is None else jnp.minimum(size, most)
+
+
 def _ending_there(
     system: AbstractSystem, motion: AbstractMotion, arc: Any, found: Any, kept: Any, stays: Any, control: Any
 ) -> tuple[Any, Any]:
@@ -342,12 +349,19 @@ def _ending_there(
     to see the surface (`_looking_often`) is not kept either."""
     if system.n_derived == 0:
         return kept, control
+    look = lambda: _not_too_early(system, motion, arc, found, kept, stays, control)  # noqa: E731
+    return if_any(stays, look, lambda: (kept, control))
+
+
+def _not_too_early(
+    system: AbstractSystem, motion: AbstractMotion, arc: Any, found: Any, kept: Any, stays: Any, control: Any
+) -> tuple[Any, Any]:
     kept, control = _looking_often(system, motion, arc, kept, stays, control)
     shortened = motion.shortened(control, (1.0 + 1e-5) * frozen(found.s * arc.unit))
     if shortened is None:
         return kept, control
     inside = (found.s > 1e-3 * arc.length) & (found.s < 0.99 * arc.length)
-    path = norm(frozen(arc.tangent(found.s)[: -system.n_derived])) * arc.length
+    path = norm(frozen(arc.tangent(found.s))) * arc.length
     inside = inside & (path > _tiny(arc, found.s))
     early = stays & kept & found.finished & (found.contact >= 0) & inside
     return kept & ~early, keep(early, shortened, control)
@@ -408,16 +422,18 @@ def _tiny(arc: Any, s: Any) -> Any:
 def find(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = None) -> Outcome:
     """Run the loop. `kind` says how the loop itself may be differentiated: `None` not at all, "lax" forward,
     "checkpointed" in reverse."""
+    return outcome_of(end_of(system, motion, state, t0, t1, max_impacts=max_impacts, log_rows=log_rows, kind=kind))
+
+
+def end_of(system, motion, state, t0, t1, *, max_impacts: int, log_rows: int, kind: Any = None) -> Carry:
+    """Where the loop ends."""
     carry = start(system, motion, state, t0, t1, log_rows, 0)
     next_turn = lambda c: turn(c, system, motion, t1, max_impacts, kind is not None)  # noqa: E731
     going = lambda c: eqxi.unvmap_any(~c.done)  # noqa: E731
     if kind in (None, "lax"):
-        end = lax.while_loop(going, next_turn, carry)
-    else:
-        end = eqxi.while_loop(
-            going, next_turn, carry, kind=kind, max_steps=motion.max_turns(system.most_rows(max_impacts))
-        )
-    return outcome_of(end)
+        return lax.while_loop(going, next_turn, carry)
+    most = motion.max_turns(system.most_rows(max_impacts))
+    return eqxi.while_loop(going, next_turn, carry, kind=kind, max_steps=most)
 
 
 def outcome_of(c: Carry) -> Outcome:

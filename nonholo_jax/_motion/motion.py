@@ -76,7 +76,7 @@ class AbstractMotion(eqx.Module):
 
 
 def _either(stays: Any, step: Arc, flight: Arc, like: Any) -> Arc:
-    """One of two arcs, as polynomials of one degree; what only steps follow is 1 in flight."""
+    """One of two arcs, as polynomials of one degree."""
     array = lambda x: jnp.asarray(x, like.dtype)  # noqa: E731
 
     def join(a: tuple, b: tuple) -> tuple:
@@ -84,11 +84,10 @@ def _either(stays: Any, step: Arc, flight: Arc, like: Any) -> Arc:
         return tuple(jnp.where(stays, array(x), array(y)) for x, y in zip(a, b, strict=True))
 
     rows = lambda a, b: tuple(join(x, y) for x, y in zip(a, b, strict=True))  # noqa: E731
-    configuration = (*flight.configuration, *[(1.0,)] * (len(step.configuration) - len(flight.configuration)))
     length, unit = (jnp.where(stays, array(a), array(b))
                     for a, b in ((step.length, flight.length), (step.unit, flight.unit)))  # fmt: skip
-    return Arc(step.time, step.start, rows(step.configuration, configuration), rows(step.rate, flight.rate), length,
-               unit, ~stays)  # fmt: skip
+    return Arc(step.time, step.start, rows(step.configuration, flight.configuration), rows(step.rate, flight.rate),
+               length, unit, ~stays, step.derived)  # fmt: skip
 
 
 def check_counts(**counts: int) -> None:
@@ -180,7 +179,8 @@ class Exact(AbstractMotion):
 
     def _flight(self, system: AbstractSystem, time: Scalar, state: Any, size: Scalar) -> Piece:
         q, v = system.evolving(state)
-        dq, a = system.derivative(time, state, q, v)
+        rates = system.derivative if self.contact is None else system.falling
+        dq, a = rates(time, state, q, v)
         configuration = tuple((x, u, times(0.5, w)) for x, u, w in zip(q, v, a, strict=False))
         configuration += tuple((x, u) for x, u in zip(q[len(v) :], dq[len(v) :], strict=True))
         rate = tuple((u, w) for u, w in zip(v, a, strict=True))

@@ -5,6 +5,7 @@ at a time: for every arc, what it began with, its size, and the contact that end
 derivatives on its own, from what it began with: in order for forward mode, from the last to the first in reverse.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +21,7 @@ from .._math import (
     PAUSES,
     Iteration,
     frozen,
+    in_a_queue,
     in_tiles,
     quotient,
     shared,
@@ -42,10 +44,12 @@ from .loop import (
     as_arrays,
     computed_once,
     empty_path,
+    end_of,
     find,
     keep,
     kind_of,
     later,
+    outcome_of,
     pack_row,
     start,
     turn,
@@ -194,10 +198,28 @@ def _find(system, motion, state, t0, t1, **options):
     if options["log_rows"] == 0 and hopper is not None:
         return _find_by_hops(*primals, alone="lax" if hopper.again is None else "hop", **options)
 
+    if system.is_long:  # a turn costs much more than to take a lane out of a tile and another one in
+        ends = _in_a_queue(motion.tile, **options)(*primals)
+        return outcome_of(ends)
+
     def many(system, motion, *rest):
         return find(system, motion.in_batch(system), *rest, **options)
 
     return in_tiles(many, motion.tile, alone=lambda *primals: find(*primals, **options))(*primals)
+
+
+def _in_a_queue(tile: int, *, max_impacts: int, log_rows: int) -> Callable:
+    """`end_of`, where a batch is a queue."""
+
+    def begin(system, motion, state, t0, t1):
+        return start(system, motion.in_batch(system), state, t0, t1, log_rows, 0)
+
+    def advance(c, system, motion, state, t0, t1):
+        del state, t0
+        return turn(c, system, motion.in_batch(system), t1, max_impacts)
+
+    alone = functools.partial(end_of, max_impacts=max_impacts, log_rows=log_rows)
+    return in_a_queue(begin, advance, lambda c: c.done, tile, alone)
 
 
 def _find_by_hops(system, motion, state, t0, t1, *, alone: str, max_impacts: int, log_rows: int):

@@ -281,7 +281,9 @@ def _moved_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, l
             return dataclasses.replace(whole, system=None, motion=None, initial=None)
 
         whole = lambda lanes: jax.vmap(one)(*lanes)  # noqa: E731
-        return by_tiles(whole, lanes, len(jax.tree.leaves(states)[0]), motion.tile) if log_rows else whole(lanes)
+        if log_rows == 0 or scene.is_long:  # which makes tiles of its own
+            return whole(lanes)
+        return by_tiles(whole, lanes, len(jax.tree.leaves(states)[0]), motion.tile)
 
     mapped = [leaf for leaf, axis in zip(moved, axes, strict=True) if axis is not None]
     whole = over_devices(batch, (states, mapped), (arrays, t0, t1), devices)

@@ -14,6 +14,7 @@ from .._math import (
     cross,
     dot,
     frozen,
+    if_any,
     minimum,
     norm,
     ratio,
@@ -100,6 +101,23 @@ class Grooved(Footing):
             pivot = dot(path.free, kept)
         return sides, groove.spin_of(path, dot(path.along, v), pivot, kept, sides.grips[0] | sides.grips[1])
 
+    def spin_there(self, time: Any, state: Travel, below: Ground, flight: Flight, q: tuple) -> Vector3:
+        """The spin of a ball that has come along a groove; zero where none is in one."""
+        there = lambda: self.spin_in_groove(time, state, below, flight.position, flight.velocity, q)[1]  # noqa: E731
+        return if_any(second_of(state) >= 0, lambda: arrays(there(), time), lambda: arrays(rolling.NONE, time))
+
+    def rates_in_groove(
+        self, time: Any, state: Travel, below: Ground, q: tuple, v: Vector3
+    ) -> tuple[Vector3, Number, Vector3]:
+        """The rates of velocity, of the spin about the free axis, and of all of the spin in a groove, or zero."""
+
+        def rates() -> tuple:
+            _, _, course = self.along_groove(time, state, below, q, v)
+            return arrays((*course.acceleration, course.pivots, *course.spins), time)
+
+        found = if_any(second_of(state) >= 0, rates, lambda: arrays((0.0,) * 7, time))
+        return found[:3], found[3], found[4:]
+
     @staticmethod
     def _headings(below: Ground, slips: tuple, sides: groove.Sides) -> tuple[Vector3, Vector3]:
         """The directions of the slips on both sides, some time after the arc began."""
@@ -112,11 +130,18 @@ class Grooved(Footing):
             found.append(where_vector(slides, later, rolling.NONE))
         return found[0], found[1]
 
-    def ends_in_groove(
-        self, state: Travel, below: Ground, sides: groove.Sides, spin: Vector3, v: Vector3, course: groove.Course
-    ) -> list[Number]:
+    def ends_in_groove(self, time: Any, state: Travel, below: Ground, q: tuple, v: Vector3) -> tuple:
         """`derived` on both sides of a groove: what holds the ball there, and, where friction may stop them, its
-        slips."""
+        slips; 1 where there is none."""
+
+        def ends() -> tuple:
+            return arrays(self._ends(state, below, *self.along_groove(time, state, below, q, v), v), time)
+
+        return if_any(second_of(state) >= 0, ends, lambda: arrays((1.0,) * self.n_derived, time))
+
+    def _ends(
+        self, state: Travel, below: Ground, sides: groove.Sides, spin: Vector3, course: groove.Course, v: Vector3
+    ) -> list[Number]:
         size, radius = frozen(total([abs(push) for push in course.pushes])), self.scene.ball.radius
         holds = [ratio(radius * push, size) for push in course.pushes]
         if below.slides is None:

@@ -1,5 +1,6 @@
 """What is below a ball that stays on a surface, which way it is driven there, and what resists it."""
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from .._math import (
     components,
     cross,
     dot,
+    minimum,
     norm,
     plus,
     ratio,
@@ -53,6 +55,7 @@ class Slides(NamedTuple):
     grips: tuple[Any, Any]  # whether it does not
     headings: tuple[Vector3, Vector3]  # in which direction it does, against friction; or zero
     straight: tuple[Any, Any]  # whether it keeps that direction until its slip ends
+    lasts: Any  # for how long both slip on, about, where their directions change; else infinite
     limits: tuple[Number, Number]  # the coefficients of friction
 
 
@@ -67,6 +70,7 @@ class Ground(NamedTuple):
     slip: Vector3  # zero of a ball that rolls, and where there is no friction to slide against
     heading: Vector3  # the direction in which it slides against friction, or zero
     straight: Any  # whether it keeps that direction until its slip ends
+    lasts: Any  # for how long it slips on, about, where its direction changes; else infinite
     flush: Neighbours | None = None  # the faces that are flush with it, if there can be any
     pivot: Number = 0.0  # the spin about the normal of a ball that rolls on a curved surface
     seams: tuple = ()  # for each pair of seams whether the ball is beyond it, and what `Floors.seam` says
@@ -121,10 +125,9 @@ class Forced(NamedTuple):
     twist: Vector3  # `rolling.twist`, of a ball that rolls
 
 
-def arrays(a: Vector3, time: Any) -> Vector3:
-    """The components as arrays of the dtype of the time."""
-    x, y, z = (jnp.asarray(c, time.dtype) for c in a)
-    return x, y, z
+def arrays(numbers: Iterable, time: Any) -> Any:
+    """The numbers as arrays of the dtype of the time."""
+    return tuple(jnp.asarray(c, time.dtype) for c in numbers)
 
 
 class Footing:
@@ -224,9 +227,9 @@ class Footing:
         flush = self._flush(time, state, n) if self.joins else None
         more = self._curved_ground(time, state, support, n, on, rolls) if self.curved else {}
         if not (floors.have_friction or any(floors.resist)):
-            return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True, flush, **more)
+            return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True, jnp.inf, flush, **more)
         a = self.pull(time, flight)
-        along, alpha, twist = rolling.along_surface(n, a), ball.inertia_ratio, rolling.NONE
+        along, alpha, twist, turn = rolling.along_surface(n, a), ball.inertia_ratio, rolling.NONE, rolling.NONE
         if self.curved:
             turn = where_vector(on, floors.turning(support, flight.position, flight.velocity, time)[1], rolling.NONE)
             twist = rolling.twist(ball.radius, more["pivot"], n, turn)
@@ -237,9 +240,10 @@ class Footing:
             more["spinning"] = where(rolls, floors.resistance(support, 1), 0.0), jnp.sign(dot(n, flight.spin))
         push, brake, slowed = -dot(a, n), None, rolling.NONE
         if floors.resist[0]:
-            brake, slowed = self._brake(support, flight, n, push, add(along, scale(alpha, twist)), rolls)
+            brake, slowed = self._brake(support, flight, n, push, add(along, scale(alpha, twist)), rolls, turn)
         if not floors.have_friction:
-            return Ground(face, edged, rolls, None, free, rolling.NONE, rolling.NONE, True, flush, brake=brake, **more)
+            none = rolling.NONE
+            return Ground(face, edged, rolls, None, free, none, none, True, jnp.inf, flush, brake=brake, **more)
         friction = floors.friction(support)
         slides = rolls & jnp.isfinite(friction)
         if self.have_grooves:
@@ -253,9 +257,11 @@ class Footing:
             drive = add(drive, scale(where(dot(slip, slip) > 0, 0.0, 1.0 + 1.0 / alpha), slowed))
         most = where(slides, friction, 0.0) * push * (1.0 + 1.0 / alpha)
         heading = where_vector(slides, rolling.heading(slip, drive, most), rolling.NONE)
-        straight = self.parabolic or rolling.stays_straight(
-            heading, slip, drive, most, self.tolerance, self._balance(most)
-        )
+        straight: Any = True
+        if not self.parabolic:
+            change = self._change(flight, turn, friction * (1.0 + 1.0 / alpha))
+            straight = rolling.ends_soon(heading, slip, drive, most, self.tolerance, change, self._balance(most))
+        lasts = where(straight, jnp.inf, rolling.lasts(heading, slip, drive, most))
         if brake is not None:
             slides = dot(heading, heading) > 0
             brake = brake._replace(coefficient=where(slides, 0.0, brake.coefficient), holds=brake.holds & ~slides,
@@ -265,7 +271,9 @@ class Footing:
             slip = where_vector(begins, scale(self.first_slip(flight), heading), slip)
         if self.have_grooves:  # there it is the spin that is followed
             slip = where_vector(second_of(state) >= 0, scale(ball.radius, flight.spin), slip)
-        return Ground(face, edged, rolls, friction, free, slip, heading, straight, flush, brake=brake, **more)
+        if self.have_grooves:
+            lasts = minimum(lasts, more["slides"].lasts)
+        return Ground(face, edged, rolls, friction, free, slip, heading, straight, lasts, flush, brake=brake, **more)
 
     def first_slip(self, flight: Flight) -> Number:
         """The slip with which one begins: so large that it does not end at once where friction hardly fails to hold it,
@@ -279,11 +287,12 @@ class Footing:
         that begins is known to the tolerance of a step."""
         return 1e3 * self.tolerance * most if self.follows_hold else 0.0
 
-    def last_slip(self, flight: Flight, slip: Vector3) -> Number:
+    def last_slip(self, flight: Flight, slip: Vector3, straight: Any = False) -> Number:
         """The slip at which one that was `slip` at the beginning of an arc counts as over: not so small that a step
-        may end there unseen and the next arc take it for rounding."""
+        may end there unseen and the next arc take it for rounding. One that goes straight to its end is not missed."""
         eps, size = self._eps(flight), norm(flight.velocity) + self.scene.ball.radius * norm(flight.spin)
-        least, speed = self.tolerance * (1.0 + size) + 256.0 * eps * size, norm(slip)
+        least = where(straight, 0.0, self.tolerance * (1.0 + size)) + 256.0 * eps * size
+        speed = norm(slip)
         return where(speed > least, least, 0.5 * speed)
 
     @staticmethod
@@ -294,7 +303,7 @@ class Footing:
         flight, radius, limits = state.flight, self.scene.ball.radius, self.limits(state)
         sides = self.sides(time, state, flight.position, flight.velocity)
         slips = groove.slips(radius, sides, flight.velocity, flight.spin)
-        grips, headings, straight = [], [], []
+        grips, headings, straight, lasts = [], [], [], jnp.inf
         for slip, limit in zip(slips, limits, strict=True):
             speed, firm = norm(slip), jnp.isinf(jnp.asarray(limit))
             slides = (speed > 0) & ~firm & (limit > 0) & (second_of(state) >= 0)
@@ -310,7 +319,9 @@ class Footing:
             aside = norm(add(rate, scale(decay, known)))
             most = 100.0 * self.tolerance
             straight.append((speed <= most) & (decay > 0) & (aside * speed <= most * decay))
-        return Slides((grips[0], grips[1]), (headings[0], headings[1]), (straight[0], straight[1]), limits)
+            turns = (speed > 0) & (decay > 0) & ~straight[-1]
+            lasts = minimum(lasts, where(turns, ratio(speed, decay), jnp.inf))
+        return Slides((grips[0], grips[1]), (headings[0], headings[1]), (straight[0], straight[1]), lasts, limits)
 
     def course(
         self, time: Any, flight: Flight, sides: groove.Sides, v: Vector3, spin: Vector3, rub: groove.Rub | None
@@ -322,7 +333,7 @@ class Footing:
         return groove.course(ball.radius, ball.inertia_ratio, sides, v, spin, pull, rub)
 
     def _brake(
-        self, support: Choice, flight: Flight, n: Vector3, push: Number, along: Vector3, rolls: Any
+        self, support: Choice, flight: Flight, n: Vector3, push: Number, along: Vector3, rolls: Any, turn: Vector3
     ) -> tuple[Brake, Vector3]:
         """What resists a ball that rolls, `along` being what drives it; and by how much that slows it."""
         share, velocity = ratio(1.0, 1.0 + self.scene.ball.inertia_ratio), rolling.along_surface(n, flight.velocity)
@@ -331,8 +342,24 @@ class Footing:
         heading, driven = rolling.heading(velocity, scale(share, along), most), scale(share, along)
         stands = (dot(heading, heading) == 0) & rolls & (coefficient > 0)
         heading = where_vector(coefficient > 0, heading, rolling.NONE)
-        straight = self.parabolic or rolling.stays_straight(heading, velocity, driven, most, self.tolerance)
+        straight: Any = True
+        if not self.parabolic:
+            change = self._change(flight, turn, coefficient)
+            straight = rolling.ends_soon(heading, velocity, driven, most, self.tolerance, change)
         return Brake(coefficient, heading, straight, stands), where_vector(stands, driven, scale(most, heading))
+
+    def _change(self, flight: Flight, turn: Vector3, friction: Number) -> Number:
+        """The part of the forces on a ball on a surface that may change in a second: `turn` is the rate of the normal,
+        `friction` what acts against the ball for a push of 1."""
+        speed = norm(flight.velocity)
+        change = 0.0
+        if self.curved:
+            turning = self.scene.ball.radius * norm(flight.spin) + speed * (1.0 + 2.0 * friction)
+            change = ratio(norm(turn), speed) * turning
+        if self.scene.air is not None:
+            drag = norm(subtract(self.pull(0.0, flight), components(self.scene.gravity)))
+            change = change + ratio(2.0 * drag, speed)
+        return change
 
     def _spinning(
         self, support: Choice, flight: Flight, n: Vector3, turn: Vector3, push: Number, rolls: Any
@@ -442,8 +469,12 @@ class Footing:
         if not self.parabolic:
             kept = rolling.carried(forced.normal, heading) if self.curved else heading
             heading = where_vector(brake.straight, kept, rolling.later_heading(v, heading))
-        against = scale(brake.coefficient * -forced.push, heading)
+        most = brake.coefficient * -forced.push
+        against = scale(most, heading)
         driven = scale(share, add(forced.along, scale(self.scene.ball.inertia_ratio, forced.twist)))
+        if not self.parabolic:
+            ends = add(driven, scale(rolling.decay(heading, driven, most), heading))
+            against = where_vector(brake.straight & (dot(heading, heading) > 0), ends, against)
         return where_vector(brake.holds, driven, against)
 
     def slip_rate(self, below: Ground, slip: Vector3, along: Vector3, forced: Forced) -> Vector3:
@@ -461,5 +492,5 @@ class Footing:
                 begins = (dot(along, heading) > most - self._balance(most)) & (norm(slip) <= self.tolerance**0.5)
                 towards = where_vector(begins, scale(ratio(1.0, norm(along)), along), towards)
             turning = subtract(along, scale(most, towards))
-            rate = where_vector(below.straight, rate, turning)
+            rate = where_vector(below.straight, scale(-rolling.decay(kept, along, most), kept), turning)
         return where_vector(slides, rate, rolling.NONE)

@@ -3,15 +3,13 @@ and leaves faces over their edges. Rolling is a phase of the same motion, on the
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from .._impact import rolling, train
 from .._math import (
@@ -24,6 +22,7 @@ from .._math import (
     cross,
     dot,
     frozen,
+    if_any,
     maximum,
     minimum,
     norm,
@@ -39,11 +38,6 @@ from .._world import AbstractSystem, Meeting, Member, Scene, along, bounces, rou
 from .floors import Floors, is_coarse, may_pass, may_settle
 from .ground import Ground, Travel, code_of, of_code, phase_of, second_of, support_of
 from .settling import Settling
-
-
-def _if_any(condition: Any, wanted: Callable, plain: Callable) -> Any:
-    """`wanted()` if a condition holds in any lane of a batch: otherwise `plain()`, which must be equal then."""
-    return lax.cond(eqxi.unvmap_any(condition), wanted, plain)
 
 
 class _Entry(NamedTuple):
@@ -165,12 +159,21 @@ class Grounded(AbstractSystem):
             lost = rolling.spin_loss(self.scene.ball, coefficient, -forced.push)
             spun = where((sign == 0) & (coefficient > 0), 0.0, spun - sign * lost)
         if settling.have_grooves:
-            inside, (_, _, course) = second_of(state) >= 0, settling.along_groove(time, state, below, q, v)
-            rate, spun = where_vector(inside, course.acceleration, rate), where(inside, course.pivots, spun)
+            inside, (faster, pivots, spins) = second_of(state) >= 0, settling.rates_in_groove(time, state, below, q, v)
+            rate, spun = where_vector(inside, faster, rate), where(inside, pivots, spun)
             if slip:
-                changes = where_vector(inside, scale(self.scene.ball.radius, course.spins), changes)
+                changes = where_vector(inside, scale(self.scene.ball.radius, spins), changes)
             slows = tuple(where(inside, 0.0, each) for each in slows)
         return (*v, *changes, spun, *slows), rate
+
+    def longest(self, state):
+        """Where a slip turns, half of the time that it lasts: then the direction in which it ends is not smooth."""
+        if self.parabolic or not self._floors.have_friction:
+            return None
+        return frozen(0.5 * self._below(0.0, state).lasts)
+
+    def falling(self, time, state, q, v):
+        return (*v, *(0.0 for _ in q[3:])), self.scene.derivative(time, state.flight, q[:3], v)[1]
 
     @property
     def n_derived(self) -> int:
@@ -200,8 +203,7 @@ class Grounded(AbstractSystem):
             hold = where(limited, spare, hold)
         if not settling.have_grooves:
             return (where(on, hold, 1.0),)
-        inside, (sides, spin, course) = second_of(state) >= 0, settling.along_groove(time, state, below, q, v)
-        first, *others = settling.ends_in_groove(state, below, sides, spin, v, course)
+        inside, (first, *others) = second_of(state) >= 0, settling.ends_in_groove(time, state, below, q, v)
         return where(on, where(inside, first, hold), 1.0), *[where(inside, x, 1.0) for x in others]
 
     def is_coarse(self, arc):
@@ -223,7 +225,7 @@ class Grounded(AbstractSystem):
             slip = rolling.along_surface(n, slip) if slip else slip
             if settling.have_grooves:
                 inside = second_of(state) >= 0
-                _, in_groove = settling.spin_in_groove(time, state, below, flight.position, flight.velocity, q)
+                in_groove = settling.spin_there(time, state, below, flight, q)
         elif below.spinning is not None:
             still = self._spun_down(time, state, below, duration)
         spin = add(still, scale(free.turning, cross(n, subtract(v, slip) if slip else v)))
@@ -306,7 +308,7 @@ class Grounded(AbstractSystem):
         if contact == self._end_of_slip and self._floors.have_friction:
             below = self._below(time, state)
             heading, slip = below.heading, dot(below.heading, q[3:6])
-            slip = slip if self.parabolic else slip - self._settling.last_slip(state.flight, below.slip)
+            slip = slip if self.parabolic else slip - self._settling.last_slip(state.flight, below.slip, below.straight)
             return where(dot(heading, heading) > 0, slip, 1.0)
         settling = self._settling
         if contact >= settling.end_of_hold:
@@ -420,7 +422,7 @@ class Grounded(AbstractSystem):
             touch = settling.touch(contact, time, state, n, struck, pull, stays)
             return _as_arrays(settling.meets(touch, left, rests, ends), time)
 
-        return _if_any((state.support >= 0) | soon, unusual, plain)
+        return if_any((state.support >= 0) | soon, unusual, plain)
 
     def after(self, contact, time, state, kind):
         settling = self._settling
@@ -431,7 +433,7 @@ class Grounded(AbstractSystem):
             return _as_arrays(settling.settled(touch, kind, train.summed(*settling.train_of(touch, kind)))[:2], time)
 
         plain = lambda: _as_arrays((Travel(struck, -1.0), 0.0), time)  # noqa: E731
-        return _if_any((state.support >= 0) | (kind != KINDS.bounce), unusual, plain)
+        return if_any((state.support >= 0) | (kind != KINDS.bounce), unusual, plain)
 
     def during(self, contact, time, state, elapsed):
         return self._settling.during(contact, time, state, elapsed)

@@ -36,11 +36,19 @@ class AbstractSystem(eqx.Module):
     n_derived: ClassVar[int] = 0  # how many numbers gaps see beside those that evolve: see `derived`
     degree_of_derived: ClassVar[int] = 4  # of the polynomials that they are along an arc
 
+    def falling(self, time: Scalar, state: Any, q: tuple, v: tuple) -> tuple[tuple, tuple]:
+        """`derivative` where nothing is touched."""
+        return self.derivative(time, state, q, v)
+
     def derived(self, time: Scalar, state: Any, q: tuple, v: tuple) -> tuple[Number, ...]:
         """Smooth functions of the motion whose zeros are contacts: what a gap sees of them along an arc is a polynomial
         through samples. For motions that step."""
         del time, state, q, v
         return ()
+
+    def longest(self, state: Any) -> Scalar | None:
+        """How many seconds a step from this prepared state may have at most; `None` where any may do."""
+        del state
 
     def is_coarse(self, arc: Any) -> Any:
         """Whether a step along a surface may have passed a part of it unseen; `None` where that cannot be."""

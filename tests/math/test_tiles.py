@@ -12,7 +12,8 @@ import pytest
 from helpers import all_surfaces, scene_of, stacked, throws
 
 from nonholo_jax import Exact, Rough, simulate, simulate_batch
-from nonholo_jax._math.tiles import in_tiles
+from nonholo_jax._math import tiles
+from nonholo_jax._math.tiles import in_a_queue, in_tiles
 
 PLANE = all_surfaces[0]
 
@@ -36,6 +37,58 @@ def test_a_tile_is_as_large_as_asked():
     """What runs at once is seen in the program: the largest array of its inner loop."""
     program = jax.make_jaxpr(jax.vmap(in_tiles(jnp.sin, 4)))(jnp.zeros(10))
     assert "f64[4]" in str(program) and "f64[3,4]" in str(program)
+
+
+@pytest.mark.parametrize("n", [1, 4, 5, 37, 700])
+def test_a_queue_of_any_length(n, monkeypatch):
+    """Lanes that take from no turn to fifty, in tiles of four: each as it goes alone, in its place, also where the line
+    is cut into several, within another batch, and with an argument that all lanes share."""
+    monkeypatch.setattr(tiles, "_LONGEST_LINE", 16)
+
+    def begin(count, x, rate):
+        return {"left": count, "x": x * jnp.ones_like(rate), "turns": jnp.zeros((2,), jnp.int32)}
+
+    def advance(c, _, __, rate):
+        going = c["left"] > 0
+        new = {"left": c["left"] - 1, "x": c["x"] * rate + 1.0, "turns": c["turns"] + 1}
+        return jax.tree.map(lambda a, b: jnp.where(going, a, b), new, c)
+
+    finished = lambda c: c["left"] <= 0  # noqa: E731
+
+    def alone(*args):
+        return jax.lax.while_loop(lambda c: ~finished(c), lambda c: advance(c, *args), begin(*args))
+
+    rng = np.random.default_rng(n)
+    counts = rng.integers(0, 8, n) + 40 * (rng.uniform(size=n) < 0.1)
+    args = jnp.asarray(counts), jnp.asarray(rng.normal(size=n)), jnp.asarray(0.9)
+    queue = in_a_queue(begin, advance, finished, 4, alone)
+    wanted = jax.vmap(alone, (0, 0, None))(*args)
+    found = jax.jit(jax.vmap(queue, (0, 0, None)))(*args)
+    assert np.array_equal(found["turns"], np.stack([counts, counts], axis=1))
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        assert np.array_equal(one, other)
+    rates = jnp.asarray([0.9, 1.1])
+    nested = jax.vmap(jax.vmap(queue, (0, 0, None)), (None, None, 0))(*args[:2], rates)
+    assert np.array_equal(nested["x"][0], wanted["x"])
+    single = queue(args[0][0], args[1][0], args[2])
+    assert np.array_equal(single["x"], wanted["x"][0])
+
+
+def test_nobody_in_a_queue_waits_for_a_slow_lane():
+    """One lane in sixteen takes a hundred turns, the others take one: 1,840 in all, where tiles of sixteen, each with a
+    slow one, would take 25,600. Lanes count what they are taken along for, finished or not."""
+    counts = jnp.where(jnp.arange(256) % 16 == 0, 100, 1)
+
+    def begin(count):
+        return {"left": count, "turns": 0 * count}
+
+    def advance(c, count):
+        del count
+        return {"left": c["left"] - 1, "turns": c["turns"] + 1}
+
+    queue = in_a_queue(begin, advance, lambda c: c["left"] <= 0, 16, begin)
+    turns = np.asarray(jax.vmap(queue)(counts)["turns"])
+    assert np.all(turns >= np.asarray(counts)) and turns.sum() < 6000
 
 
 def test_tiles_do_not_change_a_motion(getkey):

@@ -214,11 +214,11 @@ def test_slides_across_a_slope_that_it_could_hardly_roll_on():
     scene = plane_scene(Frictional(0.0, 0.2, 1.01 * TAN * ALPHA / (1.0 + ALPHA)), SLOPE)
     state = BallState([0.0, 0.0, R / n[2] + 1e-3], [0.0, 0.1, -0.1], [0.0, 0.0, 0.0])
     trajectory = simulate(scene, state, t1=6.0)
-    assert kinds(trajectory) == ["train", "gripped"] and int(trajectory.n_arcs) < 1000
+    assert kinds(trajectory) == ["train", "gripped"] and int(trajectory.n_arcs) < 150
     start = slip_of(lane_of(trajectory.impacts.after, 0), SLOPE)
     clock = np.linalg.norm(start) * most + start @ (np.array([0.0, 0.0, -G]) + G * n[2] * n)
     lasts = float(trajectory.impacts.time[1] - trajectory.impacts.until[0])
-    np.testing.assert_allclose(lasts, clock / (most**2 - h**2), rtol=1e-4)
+    np.testing.assert_allclose(lasts, clock / (most**2 - h**2), rtol=1e-5)
 
 
 def test_motion_that_a_slope_needs():
