@@ -60,9 +60,8 @@ def in_a_queue(begin: Callable, advance: Callable, finished: Callable, size: int
         first, turn = whole(begin), whole(advance)
         if n <= size or not on_cpu():
             return lax.while_loop(lambda c: ~jnp.all(finished(c)), lambda c: turn(lanes, c), first(lanes))
-        part = -(-n // -(-n // (_LONGEST_LINE * size)))  # a line is kept in memory as a whole
-        queue = lambda lanes: _queued(first, turn, finished, lanes, part, size)  # noqa: E731
-        return by_tiles(queue, lanes, n, part)
+        queue = lambda lanes: _queued(first, turn, finished, lanes, size)  # noqa: E731
+        return by_tiles(queue, lanes, n, _LONGEST_LINE * size)  # a line is kept in memory as a whole
 
     return _in_a_batch(run_all, alone)
 
@@ -152,9 +151,9 @@ def _gathered(whole: Callable, needed: Any, otherwise: Any, lanes: Any, n: int, 
     return lax.fori_loop(0, quotient(count[-1] + (size - 1), size)[0], group, otherwise)
 
 
-def _queued(first: Callable, turn: Callable, finished: Callable, lanes: Any, n: int, size: int) -> Any:
-    """`n` lanes, a tile of `size` at a time, in which those that have finished are replaced."""
-    few = max(size // 8, 1)
+def _queued(first: Callable, turn: Callable, finished: Callable, lanes: Any, size: int) -> Any:
+    """All lanes, a tile of `size` at a time, in which those that have finished are replaced."""
+    n, few = jax.tree.leaves(lanes)[0].shape[0], max(size // 8, 1)
     of = lambda tree, index: jax.tree.map(lambda x: x.at[index].get(mode="clip"), tree)  # noqa: E731
 
     def refilled(state: tuple) -> tuple:
@@ -178,10 +177,12 @@ def _queued(first: Callable, turn: Callable, finished: Callable, lanes: Any, n: 
 
 
 def by_tiles(whole: Callable, lanes: Any, n: int, size: int) -> Any:
-    """`whole` on `n` lanes; on a CPU on tiles of `size` lanes, one after the other, the last filled up with the last
-    lane."""
+    """`whole` on `n` lanes; on a CPU on tiles of at most `size` lanes, one after the other, all of one size, in eights,
+    the last filled up with the last lane."""
     if n <= size or not on_cpu():
         return whole(lanes)
+    n_tiles = -(-n // size)
+    size = min(size, -(-n // (8 * n_tiles)) * 8)
     n_tiles, padding = -(-n // size), -n % size
     tiles = jax.tree.map(
         lambda x: _filled(x, padding).reshape(n_tiles, size, *x.shape[1:]),

@@ -35,6 +35,7 @@ from .motion import AbstractMotion, Exact
 from .replay import run
 from .trajectory import Trajectory, packaged
 
+_LINE = 16  # tiles that are one queue, where each lane writes a log
 _FEW_IMPACTS = 64  # are over before XLA has made a program quick: it saves 1 us an impact, and takes 0.4 s
 _NDIM = {as_number: 0, as_vector: 1, as_pair: 1, as_quaternion: 1}
 
@@ -281,9 +282,10 @@ def _moved_batch(scene, motion, states, t0, t1, axes: tuple, max_impacts: int, l
             return dataclasses.replace(whole, system=None, motion=None, initial=None)
 
         whole = lambda lanes: jax.vmap(one)(*lanes)  # noqa: E731
-        if log_rows == 0 or scene.is_long:  # which makes tiles of its own
+        if log_rows == 0:
             return whole(lanes)
-        return by_tiles(whole, lanes, len(jax.tree.leaves(states)[0]), motion.tile)
+        size = motion.tile * (_LINE if scene.is_long else 1)
+        return by_tiles(whole, lanes, len(jax.tree.leaves(states)[0]), size)
 
     mapped = [leaf for leaf, axis in zip(moved, axes, strict=True) if axis is not None]
     whole = over_devices(batch, (states, mapped), (arrays, t0, t1), devices)
