@@ -335,9 +335,9 @@ def turn(
 
 
 def _size(system: AbstractSystem, motion: AbstractMotion, control: Any, ready: Any, left: Any, stays: Any) -> Any:
-    """The size in seconds of the next arc."""
+    """The size in seconds of the next arc: constant steps stay so."""
     size, most = motion.size(control, left, stays), system.longest(ready)
-    return size if most is None else jnp.minimum(size, most)
+    return size if most is None or motion.shortened(control, most) is None else jnp.minimum(size, most)
 
 
 def _ending_there(
