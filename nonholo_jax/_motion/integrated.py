@@ -349,10 +349,10 @@ def _with_derived(system: Any, arc: Arc) -> Arc:
         return tuple(jnp.asarray(x, s.dtype) for x in found)
 
     at = jnp.asarray(nodes, arc.length.dtype)  # pyright: ignore
-    none = lambda: (jnp.ones_like(at),) * system.n_derived  # noqa: E731
-    values = if_any(system.phase(arc.start) >= 0, lambda: jax.vmap(sample)(at), none)
     weights = jnp.asarray(inverse, arc.length.dtype)  # pyright: ignore
-    fitted = [_product(weights, x) for x in values]
+    fit = lambda: tuple(_product(weights, x) for x in jax.vmap(sample)(at))  # noqa: E731
+    one = lambda: (jnp.zeros_like(at).at[0].set(1.0),) * system.n_derived  # noqa: E731
+    fitted = if_any(system.phase(arc.start) >= 0, fit, one)
     return dataclasses.replace(arc, derived=tuple(tuple(x[i] for i in range(degree + 1)) for x in fitted))
 
 
